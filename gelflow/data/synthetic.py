@@ -36,17 +36,16 @@ def synthetic_records(folder: Path, frames_apart: int | None = None) -> list[Pai
     rendered.
     """
     header, manifest = _read_header(folder / "dataset.json"), folder / "manifest.jsonl"
-    outputs, kind = (_setting(header, *keys) for keys in (("outputs",), ("sampling", "kind")))
-    if _setting(header, "outputs", "images") is False:
+    outputs, of_clips = _part(header, "outputs"), _part(header, "sampling").get("kind") == "clips"
+    if outputs.get("images") is False:
         raise InputError(f"{folder}: has no images; it was made with outputs.images = false")
     records = []
     for index, frames in sorted(_finished(manifest).items()):
         name = f"{index:06d}"
-        sample = folder / ("clips" if kind == "clips" else "samples") / name
+        sample = folder / ("clips" if of_clips else "samples") / name
         scene = scene_and_pattern(header, sample / "meta.json")
-        if kind == "clips":
-            has_previous = isinstance(outputs, dict) and outputs.get("previous") is True
-            found = _clip_pairs(name, sample, frames, frames_apart, has_previous)
+        if of_clips:
+            found = _clip_pairs(name, sample, frames, frames_apart, outputs.get("previous") is True)
         else:
             found = [PairRecord(name, sample / "image1.png", sample / "image2.png", sample / "flow.exr")]
         for record in found:
@@ -72,12 +71,11 @@ def _clip_pairs(name: str, clip: Path, frames: int, apart: int | None, has_previ
     return records
 
 
-def _setting(header: dict[str, Any], *keys: str) -> Any:
-    """A setting of the scene; None where there is none."""
-    value: Any = header.get("scene")
-    for key in keys:
-        value = value.get(key) if isinstance(value, dict) else None
-    return value
+def _part(header: dict[str, Any], name: str) -> dict[str, Any]:
+    """A table of the scene; empty where there is none."""
+    scene = header.get("scene")
+    part = scene.get(name) if isinstance(scene, dict) else None
+    return part if isinstance(part, dict) else {}
 
 
 def origin(description: Any) -> str | None:

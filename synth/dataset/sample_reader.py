@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,11 +118,7 @@ class _Read(Sequence[Item]):
     def __len__(self) -> int:
         return len(self._numbers)
 
-    @overload
-    def __getitem__(self, at: int) -> Item: ...
-    @overload
-    def __getitem__(self, at: slice) -> "_Read[Item]": ...
-    def __getitem__(self, at: int | slice) -> "Item | _Read[Item]":
+    def __getitem__(self, at: Any) -> Any:
         return _Read(self._read, self._numbers[at]) if isinstance(at, slice) else self._read(self._numbers[at])
 
 

@@ -99,14 +99,9 @@ def since_before(
 ) -> dict[str, FlowArray]:
     """Channels of a clip's frame that say what happened since the frame before.
 
-    Args:
-        view: as for `exact_flow`.
-        first: (v, 3) float64 mm, the vertices in the first state.
-        before: the same in the state before.
-        now: the same in this state.
-        previous: previous.U/V/visible: the forward flow from the state before to this one, at its own pixels.
-        slip: whether material points slipped, 1, 0 or NaN, by their places (n, 3) mm undeformed, before and now; gives
-            slip.Y at the pixels of the first state.
+    The states are the first, the one before and this one, vertices (v, 3) float64 mm. `previous` gives
+    previous.U/V/visible, the forward flow from the state before at its own pixels. `slip` says which material points
+    slipped, 1, 0 or NaN, by their places (n, 3) mm undeformed, before and now, and gives slip.Y at the first's pixels.
     """
     found: dict[str, FlowArray] = {}
     if previous:

@@ -10,20 +10,11 @@ from synth.flow.view import View
 
 
 def tracks(view: View, flattened: Pixels, dots: Pixels, states: Sequence[Points]) -> FloatArray:
-    """Where a camera sees dots in each state, dot by dot.
+    """Where a camera sees dots in each state, dot by dot: the columns of `synth.dataset.tracks.MARKERS`.
 
-    A dot is a material point: that of the surface's triangles at its place in the texture. By each path of the camera
-    (straight, or by a mirror) it is another one.
-
-    Args:
-        view: the camera and the surface.
-        flattened: (v, 2) places in the texture of the surface's vertices, mm.
-        dots: (n, 2) places in the texture of the dots' centres, mm.
-        states: vertices (v, 3) float64 mm in each state.
-
-    Returns:
-        (tracks * states, 7) rows of number, state, x, y, u, v (px, u and v since the first state), and whether it is
-        seen, 1 or 0, of the dots that are seen in some state. NaN beyond the lens model's field.
+    A dot is a material point: that of the surface's triangles at its place in the texture. Places of vertices
+    (v, 2) and of dots (n, 2) are mm, states vertices (v, 3) float64 mm. Returns (tracks * states, 7) rows of those that
+    are seen in some state, each by one path of the camera (straight, or by a mirror); NaN beyond the lens's field.
     """
     if not len(dots):
         return np.zeros((0, 7))

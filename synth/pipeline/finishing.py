@@ -6,6 +6,7 @@ that has the GPU.
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -49,27 +50,22 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
     count, entries, warning = len(simulated.samples), [], ""
     shared = {"simulate": simulated.seconds / count, "render": rendered.seconds / count}
     for shown in simulated.samples:
-        started, tracing = time.perf_counter(), Stopwatch()
+        started, tracing = time.perf_counter(), list[float]()
         sample = _sample(context, rendered, shown, diagnostics, views, tracing)
         if shown is simulated.samples[0] and simulated.scene.outputs.images:
             warning = _warning(context, sample, views[""], rendered.frames[shown.frames[0]])
         entry = write_sample_files(context.out, sample, context.job)
-        writing = time.perf_counter() - started - tracing.seconds
-        seconds = {**shared, "flow": tracing.seconds, "write": writing}
+        seconds = {**shared, "flow": sum(tracing), "write": time.perf_counter() - started - sum(tracing)}
         entries.append(replace(entry, seconds={stage: round(value, 4) for stage, value in seconds.items()}))
     return Outcome(tuple(entries), simulated.failures, (), tuple(filter(None, (simulated.warning, warning))))
 
 
-class Stopwatch:
-    """Adds up the seconds of its `with` blocks."""
-
-    seconds = 0.0
-
-    def __enter__(self) -> None:
-        self._started = time.perf_counter()
-
-    def __exit__(self, *error: object) -> None:
-        self.seconds += time.perf_counter() - self._started
+@contextmanager
+def _timed(spent: list[float]) -> Iterator[None]:
+    """Puts the seconds of a block on a list."""
+    started = time.perf_counter()
+    yield
+    spent.append(time.perf_counter() - started)
 
 
 def _warning(context: JobContext, sample: Sample, view: View, frame: Frame) -> str:
@@ -99,11 +95,11 @@ def _sample(
     shown: SampleFrames,
     diagnostics: Mapping[str, Any],
     views: Mapping[str, View],
-    tracing: Stopwatch,
+    tracing: list[float],
 ) -> Sample:
     """`views` are the trajectory's cameras by name; the flow is traced, and timed, when it is written."""
     simulated = rendered.simulated
-    scene, outputs, is_clip = simulated.scene, simulated.scene.outputs, simulated.scene.sampling.is_of_clips
+    scene, outputs, is_clip = simulated.scene, simulated.scene.outputs, simulated.scene.sampling.kind == "clips"
     states = [simulated.states[frame] for frame in shown.frames]
     solver, patches = [state.summary() for state in states], []
     if outputs.contact or is_clip:
@@ -119,7 +115,7 @@ def _sample(
         own = (k,) if k else ()  # of each further camera's noise
         numbered = enumerate(frames) if outputs.images else ()
         flows = _flows(outputs, views[name], frames, states, patches, tracing)
-        with tracing:
+        with _timed(tracing):
             images = tuple(
                 expose(context, sensor.camera, frame.radiance[name], (shown.index, number, *own))
                 for number, frame in numbered
@@ -155,12 +151,12 @@ def _flows(
     frames: Sequence[Frame],
     states: Sequence[State],
     patches: Sequence[ContactPatch],
-    tracing: Stopwatch,
+    tracing: list[float],
 ) -> Iterator[FlowField]:
     """The exact flow from the first frame to each other, with what else the outputs ask for."""
     surface, places = view.surface, [frame.positions for frame in frames]
     for k in range(1, len(frames)):
-        with tracing:
+        with _timed(tracing):
             flow = exact_flow(
                 view,
                 places[0],

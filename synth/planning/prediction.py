@@ -91,8 +91,8 @@ def predict(plan: Plan) -> Prediction:
     sampling, corner = template.sampling, template.corners[0]
     samples = sampling.samples_per_trajectory
     steps = float(np.mean([one.motion.steps for one in template.corners]))
-    images, flows = (steps + 1, steps) if sampling.is_of_clips else (2.0, 1.0)
-    rendered = (steps if sampling.is_of_clips else 1 + 1 / samples) if outputs.images else 0.0
+    images, flows = (steps + 1, steps) if sampling.kind == "clips" else (2.0, 1.0)
+    rendered = (steps if sampling.kind == "clips" else 1 + 1 / samples) if outputs.images else 0.0
     cameras = [view.camera for view in corner.sensor.views.values()]
     presses, resolution, error_px = _tetwild_meshes(plan) if plan.mesh.kind == "tetwild" else _meshes(plan)
     simulate = float(np.mean([_simulation_seconds(scene, nodes, plan) for scene, nodes in presses]))

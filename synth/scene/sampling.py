@@ -102,7 +102,7 @@ def samples_of(template: Template, seed: int, trajectory: int, steps: int) -> li
     The first pair shows the undeformed gel and the last state; the others are drawn from all other pairs i < j.
     """
     sensor, count = sensor_of(template, trajectory), template.sampling.samples_per_trajectory
-    if template.sampling.is_of_clips:
+    if template.sampling.kind == "clips":
         return [SampleFrames(trajectory, trajectory, sensor, tuple(range(steps + 1)))]
     others = [(i, j) for i in range(steps) for j in range(i + 1, steps + 1) if (i, j) != (0, steps)]
     rng = stream(template, seed, "pairs", trajectory)

@@ -43,10 +43,7 @@ class Outputs(Part):
 
 
 class Sampling(Part):
-    """What a sample is, and how random instances are shared.
-
-    These are samples of a trajectory, trajectories of a sensor, values of several scenes.
-    """
+    """What a sample is, and how instances are shared: samples of a trajectory, trajectories of a sensor, values."""
 
     kind: Literal["pairs", "clips"] = "pairs"
     """pairs: two states of a trajectory; clips: all recorded states of one."""
@@ -58,12 +55,8 @@ class Sampling(Part):
     """Draw by seed and number alone: scenes that differ in fixed values get the same gels and presses."""
 
     @property
-    def is_of_clips(self) -> bool:
-        return self.kind == "clips"
-
-    @property
     def samples_per_trajectory(self) -> int:
-        return 1 if self.is_of_clips else self.pairs_per_trajectory
+        return 1 if self.kind == "clips" else self.pairs_per_trajectory
 
 
 class Scene(Part):
@@ -85,7 +78,7 @@ class Scene(Part):
         gel, size, motion = self.sensor.gel, self.sensor.gel.size_mm, self.motion
         self._check_place()
         for name in ("slip", "previous"):
-            if getattr(self.outputs, name) and not self.sampling.is_of_clips:
+            if getattr(self.outputs, name) and self.sampling.kind != "clips":
                 raise ValueError(f'outputs.{name} = true: pairs have no frame before; give sampling.kind = "clips"')
         deepest = 0.85 * (gel.depth_mm - (0.0 if gel.is_round else gel.face_mm(*motion.position_mm)))
         if motion.depth_mm < -50:
