@@ -49,13 +49,8 @@ class _Meta(BaseModel):
 
     @model_validator(mode="after")
     def _of_one_length(self) -> "_Meta":
-        lengths = {
-            len(self.frames),
-            len(self.force_n),
-            len(self.torque_nmm),
-            len(self.diagnostics.solver or self.frames),
-        }
-        if len(lengths) > 1 or len(self.frames) < 2:
+        of_frames = (self.frames, self.force_n, self.torque_nmm, self.diagnostics.solver or self.frames)
+        if len({len(rows) for rows in of_frames}) > 1 or len(self.frames) < 2:
             raise ValueError("frames, force_n, torque_nmm and solver must be of one length, at least 2")
         return self
 
@@ -172,9 +167,7 @@ class ClipData:
         InputError for a frame that it has not, or a file that is missing or damaged.
         """
         if not (0 <= first < len(self) and 0 <= second < len(self) and first != second):
-            raise InputError(
-                f"{self.folder}: frames {first}, {second}: give two different ones of 0 to {len(self) - 1}"
-            )
+            raise InputError(f"{self.folder}: frames {first}, {second}: give two of 0 to {len(self) - 1}")
         frames = (first, second)
         rows = {name: [self.meta[name][frame] for frame in frames] for name in ("force_n", "torque_nmm")}
         told = self.meta.get("diagnostics", {})
@@ -212,9 +205,8 @@ def read_clip(folder: Path, camera: str = "") -> ClipData:
     meta = read_meta(folder)
     layout = Layout.of(meta["scene"])
     if camera not in layout.cameras:
-        raise InputError(
-            f"{folder}: has no camera {camera!r}; it has {', '.join(layout.cameras[1:]) or 'the main one'}"
-        )
+        names = ", ".join(layout.cameras[1:]) or "none"
+        raise InputError(f"{folder}: has no camera {camera!r}; beside the main camera it has: {names}")
     surface, displacements = _read_surface(folder / "surface.npz", layout)
     states = read_table(folder / STATES_FILE, STATES)
     if not len(meta["frames"]) == len(states) == len(displacements):

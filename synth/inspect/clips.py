@@ -51,16 +51,16 @@ def _curves(clip: ClipData) -> Rgb:
     time = states["time_s"]
     for axis in "xyz":
         upper.plot(time, states[f"f{axis}_n"], label=f"F{axis}", marker=".")
-    lower.plot(time, states["slip_ratio"], "C3.-", label="slip ratio")
+    lower.plot(time, states["slip_ratio"], "C3.-")
     area = lower.twinx()
-    area.plot(time, states["contact_area_mm2"], "C4.--", label="contact, mm²")
+    area.plot(time, states["contact_area_mm2"], "C4.--")
     step = time[1] - time[0]
     for at in time[states["gross_slip"] == 1]:
         for axes in (upper, lower):
             axes.axvspan(at - step / 2, at + step / 2, color="C3", alpha=0.12, linewidth=0)
     upper.set(ylabel="N")
-    lower.set(xlabel="s (shaded: all of the contact slides)", ylabel="slip ratio", ylim=(-0.05, 1.05))
-    area.set(ylabel="contact, mm²")
+    lower.set(xlabel="s (shaded: all of the contact slides)", ylabel="slip ratio (line)", ylim=(-0.05, 1.05))
+    area.set(ylabel="contact, mm² (dashed)")
     upper.legend(loc="upper left", fontsize=8)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from commands import refused, said
 from PIL import Image
-from tiny_scene import fingerprint, home, own_cache, write_tiny
+from tiny_scene import TEXT, fingerprint, home, own_cache, write_tiny
 
 from gelflow import PairDataset
 from synth.cli import main
@@ -25,6 +25,7 @@ from synth.dataset.shard import Shard
 from synth.dataset.tracks import STATES
 from synth.pipeline.generate import Scheduling, generate
 from synth.planning import job_variant, plan, predict
+from synth.render.renderer import Renderer
 from synth.scene.template import Template, load_scene
 from synth.verify import verify_dataset
 from synth.verify.camera import ForwardCamera
@@ -155,9 +156,6 @@ def test_a_slide_is_gross_slip_and_slip_is_told_where_there_is_contact(tmp_path:
         assert (np.isfinite(flow.extras["slip.Y"]) == (flow.extras["contact.Y"] == 1)).all()
     assert (clip.states["gross_slip"] == (clip.states["slip_ratio"] == 1)).all()
     assert clip.states["gross_slip"][[0, -1]].tolist() == [0, 1]
-    # T = μ N where all slides one way over a flat contact: this one is steep by up to 17 degrees.
-    friction = np.hypot(clip.states["fx_n"], clip.states["fy_n"])[-1] / clip.states["fz_n"][-1]
-    assert friction == pytest.approx(0.05, rel=0.1)
     assert np.nanmean(clip.flows[-1].extras["slip.Y"]) > 0.7  # pixels at the front came to touch since
 
 
@@ -195,10 +193,14 @@ generate(load_scene(sys.argv[1], sys.argv[3:]), 3, sys.argv[2])
     assert verify_dataset(out).ok
 
 
-def test_files_that_went_missing_are_made_again(template: Template, made: Path, copy: Path) -> None:
+def test_files_that_went_missing_are_made_again_with_one_picture_a_frame(template, made, copy, monkeypatch) -> None:
+    rendered = []
+    radiances = Renderer.radiances
+    monkeypatch.setattr(Renderer, "radiances", lambda *given: rendered.append(given) or radiances(*given))
     (copy / "clips" / "000001" / "frames" / "000003.png").unlink()
     (copy / "clips" / "000002" / "meta.json").write_text("{}")
     assert generate(template, 3, copy).made == 2
+    assert len(rendered) == 2 * (STEPS + 1)  # of two sensors, whose frames at rest are shared by their clips
     assert fingerprint(copy) == fingerprint(made)
 
 
@@ -212,7 +214,7 @@ def test_any_two_frames_are_a_pair_with_exact_flow(dataset: Dataset) -> None:
     np.testing.assert_array_equal(neighbours.forward, np.stack(stored, axis=-1))
     np.testing.assert_array_equal(neighbours.meta["force_n"], [clip.meta["force_n"][k] for k in (3, 4)])
     np.testing.assert_array_equal(clip.pair(3, 0).forward, from_rest.backward)
-    refused("frames 1, 7: give two different ones of 0 to 6", clip.pair, 1, 7)
+    refused("frames 1, 7: give two of 0 to 6", clip.pair, 1, 7)
     refused("holds clips, not pairs", dataset.read, 0)
     assert len(clip.images[2:4]) == 2
 
@@ -335,3 +337,29 @@ def test_plan_tells_seconds_and_bytes_of_a_clip_and_pairs_have_no_frame_before(m
     for name in ("slip", "previous"):
         message = rf'outputs\.{name} = true: pairs have no frame before; give sampling\.kind = "clips"'
         refused(message, lambda name=name: load_scene(path, [f"outputs.{name}=true"]).corners)
+
+
+def test_further_cameras_have_frames_flow_and_markers_of_their_own(tmp_path: Path, capsys) -> None:
+    h5py = pytest.importorskip("h5py")
+    view = "width = 40, height = 30, fx = 95, fy = 95, cx = 20, cy = 15, read_noise = 0.002"
+    left = f'further_cameras = [{{ name = "left", position_mm = [-2.0, 0.5, 19.0], {view} }}]\n[sensor.camera]'
+    text = TEXT.replace("[sensor.camera]", left)
+    generate(load_scene(write_tiny(tmp_path, text), [*CLIPS[:1], *CLIPS[4:], "motion.steps=2"]), 1, tmp_path / "d")
+    dataset = read_dataset(tmp_path / "d")
+    main_clip, clip = dataset.read_clip(0), dataset.read_clip(0, "left")
+    assert set(dataset.entry(0).sha256) >= {"left/frames/000002.png", "left/flow/000001.exr", "left/markers.csv"}
+    assert (clip.images[1].shape, clip.pair(1, 2).forward.shape) == ((30, 40, 3), (30, 40, 2))
+    stored = [clip.flows[1].extras[f"previous.{part}"] for part in ("U", "V")]
+    np.testing.assert_array_equal(clip.pair(1, 2).forward, np.stack(stored, axis=-1))
+    assert (main_clip.states == clip.states).all()
+    assert np.abs(main_clip.markers["x"][:9] - clip.markers["x"][:9]).max() > 1
+    checks = [check.name for check in verify_dataset(tmp_path / "d").samples[0].checks if check.passed]
+    assert {"forward flow", "left: forward flow", "left: previous visibility"} <= set(checks)
+    assert verify_dataset(tmp_path / "d").ok
+    found = json.loads(said(capsys, main, "inspect", tmp_path / "d", "--html", tmp_path / "p.html", "--json"))
+    assert [one["name"] for one in found["samples"]] == ["000000", "000000/left"]
+    assert (tmp_path / "p.html").read_text().count("data:image/webp") == 2
+    refused("has no camera 'right'; beside the main camera it has: left", dataset.read_clip, 0, "right")
+    export(tmp_path / "d", "hdf5", tmp_path / "o")
+    with h5py.File(tmp_path / "o" / "hdf5" / "0.hdf5") as episode:
+        np.testing.assert_array_equal(episode["tactile/left/rgb"], np.array(clip.images))
