@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 import gelflow.cli
 import synth
@@ -106,8 +107,16 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_examples_are_short() -> None:
     programs = sorted(EXAMPLES.glob("*.py"))
-    assert len(programs) == 7
+    assert len(programs) == 8
     assert [program.name for program in programs if len(program.read_text().splitlines()) > 40] == []
+
+
+def test_make_clip(tmp_path: Path) -> None:
+    quick = ['numerics={ element = "p1p1", edge_length_mm = 1.0 }', "render.samples_per_pixel=4", "motion.steps=7"]
+    printed = run("make_clip.py", "--out", tmp_path / "clip", "--set", *quick)
+    assert found(rf"8 frames, at most {NUMBER} N; slides as a whole in [1-7] of them", printed)[0] > 0.3
+    assert Image.open(tmp_path / "clip" / "film.webp").n_frames == 8
+    assert (tmp_path / "clip" / "states.png").stat().st_size > 10_000
 
 
 def test_read_exr(dataset: Path) -> None:

@@ -1,5 +1,7 @@
 """`flow.exr`: an exact flow as an OpenEXR image, float32, ZIP-compressed.
 
+Of a clip `flow/000001.exr`, whose image 1 is frame 0 and image 2 frame 1.
+
 Channels (of two directions, both read `I1(x) = I2(x + forward(x))`, `I2(x) = I1(x + backward(x))`):
 
     forward.U forward.V forward.visible   backward.U backward.V backward.visible
@@ -62,6 +64,15 @@ OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
         "MPa, frame of the scene; force of the indenter on the gel per undeformed area, in image 2's state; in image 1",
     ),
     "contact": (("contact.Y",), "1 where the indenter touches in image 2's state, else 0; in image 1"),
+    "slip": (
+        ("slip.Y",),
+        "1 where the point moved along the indenter since the frame before, 0 where it stuck, NaN without contact; in "
+        "image 1",
+    ),
+    "previous": (
+        ("previous.U", "previous.V", "previous.visible"),
+        "px; as forward, from the frame before image 2 to image 2, in the frame before",
+    ),
 }
 """Names of channels, and their unit, frame, state and image, by the key of `[outputs]` that asks for them."""
 
