@@ -6,6 +6,7 @@ from commands import refused
 from render_scenes import FAST, needs_llvm, small_sensor
 
 from synth.arrays import FloatArray
+from synth.calibrate.ball_fit import Balls, find_presses
 from synth.calibrate.contact import change, find_contact, flanks
 from synth.calibrate.irradiance import LightGeometry, LitGel
 from synth.calibrate.layouts import chosen
@@ -56,6 +57,45 @@ def _encoded(radiance: FloatArray) -> FloatArray:
 def test_a_frame_without_a_contact_is_refused() -> None:
     noise = np.random.default_rng(0).normal(0, 0.5, (120, 160, 3))
     refused("frame: no ball's contact is seen", find_contact, noise, "frame")
+
+
+def _on_a_ball(radius_px: float) -> FloatArray:
+    """What a ball changes, encoded (120, 160, 3): planes of 60 levels within a circle."""
+    y, x = np.mgrid[:120, :160] + 0.5
+    u, v = (x - 80) / radius_px, (y - 60) / radius_px
+    return np.stack([u, -v, v], axis=-1) * (np.hypot(u, v) < 1)[:, :, None] * 60 / 255
+
+
+WRONG = {
+    "no contact": (_on_a_ball(20.0) * 0, 3.0, "b.png: no ball's contact is seen in it"),
+    "another radius": (_on_a_ball(40.0), 1.0, r"has a radius of \S+ mm, which no ball of --radius-mm = 1 makes"),
+    "another sensor": (
+        _on_a_ball(20.0) + 0.1,
+        3.0,
+        "beside the ball it differs by 25.5 of 255 from the frames at rest",
+    ),
+}
+
+
+@pytest.mark.parametrize(("changed", "radius", "message"), WRONG.values(), ids=WRONG)
+def test_frames_that_the_ball_cannot_have_made_are_refused(changed: FloatArray, radius: float, message: str) -> None:
+    rest, bare = np.full((120, 160, 3), 0.4), {"b.png": np.ones((120, 160), dtype=bool)}
+    balls = Balls({"b.png": rest + changed}, radius, 0.5)
+    assert refused(message, find_presses, _sensor(-90.0, 20.0, 140.0), balls, rest, bare).count("\n") == 0
+
+
+def test_a_press_through_the_gel_is_refused() -> None:
+    message = "\\Aa ball of 3 mm pressed in by 2.8 mm: motion.depth_mm = 2.8 is more than 85 %.*\\Z"
+    refused(message, press_ball, _sensor(0.0, 120.0, 240.0), 3.0, 2.8, np.zeros(2), 0.5)
+
+
+def test_a_camera_that_moved_is_refused() -> None:
+    """Light that falls off by a level a pixel, seen 12 px beside."""
+    rest = np.linspace(0.2, 0.8, 172)[None, :, None] * np.ones((120, 1, 3))
+    frame = rest[:, 12:] + _on_a_ball(20.0)
+    balls, bare = Balls({"b.png": frame}, 3.0, 0.5), {"b.png": np.ones((120, 160), dtype=bool)}
+    sensor = _sensor(-90.0, 20.0, 140.0)
+    refused("the camera moved, or it is another sensor's", find_presses, sensor, balls, rest[:, :160], bare)
 
 
 @needs_llvm
