@@ -77,6 +77,10 @@ def calibrate(
     rest_map: Annotated[
         bool, Parameter(negative="", help="Also write what lights do not explain as rest_map.png, for the scene.")
     ] = False,
+    measured: Annotated[
+        bool,
+        Parameter(negative="", help="With --ball: light measured on its slopes, in place of lights that are fitted."),
+    ] = False,
     assignments: Assignments = None,
     as_json: AsJson = False,
 ) -> int:
@@ -88,7 +92,9 @@ def calibrate(
     from synth.calibrate import run_calibrate
 
     balls, others, changes = (ball or [], judge_ball or [], radius_mm), judge or [], assignments or []
-    return run_calibrate(scene, frames or [], others, out, changes, spacing_mm, steps, as_json, rest_map, balls)
+    return run_calibrate(
+        scene, frames or [], others, out, changes, spacing_mm, steps, as_json, rest_map, balls, measured
+    )
 
 
 @app.command

@@ -1,6 +1,7 @@
 """Lights fitted to presses of a ball, together with the gel at rest: from several layouts, with place and depth."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +28,9 @@ _MOVED_LEVELS = 10.0
 """Levels of 255 by which half of a frame may differ from the gel at rest beside the contact; auto-exposure takes 6."""
 _SIMULATIONS, _TOLERANCE = 22, 0.05
 """Presses simulated to find one's place and depth, and how near (mm, and share of the depth) is enough."""
+_DEEPER, _SHORT = 0.1, 4
+"""Change of the depths' logarithm, and steps of the lights' fit, by which the depth of all presses is found. Lower
+lights colour flatter flanks alike, so that fitting one beside the other hardly moves either."""
 _EDGE = 0.9
 """Share of the circle's radius within which flanks are measured."""
 
@@ -132,6 +136,9 @@ def fit_balls(
     def fitted(start: LightGeometry, vignetting: float, most: int, limits: Room) -> LightFit:
         return fit_lights((gel, *changes), whole, start, shines, vignetting, limits, most)
 
+    def deeper(presses: list[Press], by: float) -> list[Press]:
+        return [replace(press, pose=press.pose + np.array([0.0, 0.0, by])) for press in presses]
+
     def placed(press: Press, fit: LightFit) -> Press:
         part = _with_changes(None, sensor, [press])
         gain = (sensor.camera.exposure * (1 - fit.vignetting * part.corner))[:, None]
@@ -159,9 +166,18 @@ def fit_balls(
     fits = [fitted(start, first.vignetting, max(steps // 2, 1), limits)
             for start, limits in zip((like, everywhere), rooms, strict=True)]  # fmt: skip
     best = int(np.argmin([fit.residual for fit in fits]))
-    told = [placed(press, fits[best]) for press in told]
+    fit, told = fits[best], [placed(press, fits[best]) for press in told]
+    missed = np.full(3, np.inf)
+    for number, by in enumerate((-_DEEPER, 0.0, _DEEPER)):
+        with suppress(InputError):  # too deep for the gel
+            changes = [change_of(press) for press in deeper(told, by)]
+            missed[number] = fitted(fit.geometry, fit.vignetting, min(steps, _SHORT), rooms[best]).residual ** 2
+    at = float(np.argmin(missed) - 1)
+    if np.isfinite(missed).all() and missed[1] == missed.min():
+        at = 0.5 * (missed[0] - missed[2]) / (missed[0] - 2 * missed[1] + missed[2])  # the parabola's least
+    told = deeper(told, _DEEPER * at)
     changes = [change_of(press) for press in told]
-    fit = fitted(fits[best].geometry, fits[best].vignetting, steps, rooms[best])
+    fit = fitted(fit.geometry, fit.vignetting, steps, rooms[best])
     judged = [placed(press, fit) for press in presses if press.name in balls.judged]
     models = []
     for press in (*told, *judged):

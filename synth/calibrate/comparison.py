@@ -15,6 +15,7 @@ from synth.calibrate.pressed_ball import PressedBall
 from synth.errors import InputError
 from synth.mesh import rest_surface
 from synth.render.camera_image import encoded, expected_signal
+from synth.render.measured_light import LightModel
 from synth.render.pattern import albedo, pixels_per_mm
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant
@@ -59,7 +60,13 @@ class Comparison:
         return float(np.percentile(local[self.outside], 99)), (int(column), int(row))
 
 
-def render_gel(sensor: Sensor, render: Render, variant: Variant, pressed: PressedBall | None = None) -> FloatArray:
+def render_gel(
+    sensor: Sensor,
+    render: Render,
+    variant: Variant,
+    measured: LightModel | None = None,
+    pressed: PressedBall | None = None,
+) -> FloatArray:
     """The gel's picture (H, W, 3) at rest or pressed, encoded, in [0, 1], without noise and quantisation.
 
     Dots are drawn on their grid without jitter, which no frame tells for another gel.
@@ -69,7 +76,7 @@ def render_gel(sensor: Sensor, render: Render, variant: Variant, pressed: Presse
         even = sensor.pattern.model_copy(update={"jitter_mm": 0.0, "radius_jitter": 0.0})
         plain = sensor.model_copy(update={"pattern": even})
     surface = rest_surface(sensor.gel) if pressed is None else pressed.surface
-    renderer = Renderer(sensor, render, surface, albedo(plain, np.random.default_rng(0)), variant)
+    renderer = Renderer(sensor, render, surface, albedo(plain, np.random.default_rng(0)), variant, measured)
     positions = surface.material if pressed is None else pressed.positions
     return encoded(expected_signal(renderer.radiance(positions, 0), sensor.camera), sensor.camera)
 
