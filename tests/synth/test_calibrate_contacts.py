@@ -1,8 +1,13 @@
 """What a ball's contact tells of the lights."""
 
+import json
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
-from commands import refused
+import tomli_w
+from commands import refused, said
 from render_scenes import FAST, needs_llvm, small_sensor
 
 from synth.arrays import FloatArray
@@ -13,9 +18,11 @@ from synth.calibrate.layouts import chosen
 from synth.calibrate.lights import Target
 from synth.calibrate.pressed_ball import press_ball
 from synth.calibrate.sensor_fit import room_of
+from synth.cli import main
+from synth.render.camera_image import camera_image
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
-from synth.scene import Light, Render, Sensor
+from synth.scene import Light, NoPattern, Render, Sensor
 
 
 def _sensor(*azimuths: float) -> Sensor:
@@ -127,3 +134,48 @@ def test_a_layout_is_chosen_from_all_around_and_not_near_the_presets() -> None:
     found = chosen([gel], target, like, np.eye(3, dtype=bool), 0.0, room_of(start))
     azimuth = np.degrees(np.arctan2(found.centre[:, 1], found.centre[:, 0]))
     assert azimuth == pytest.approx([-90, 15, 135], abs=15.1)  # candidates are 15 degrees apart
+
+
+@pytest.mark.slow
+@needs_llvm
+def test_known_lights_are_found_from_three_frames_at_rest_and_three_presses(tmp_path: Path, capsys) -> None:
+    """Through the command, started 70 degrees off; a fourth press is judged and not fitted."""
+    azimuths = np.array([-80.0, 35.0, 150.0])
+    truth, start = (
+        _sensor(*azimuths + turn).model_copy(update={"pattern": NoPattern(kind="none")}) for turn in (0, 70)
+    )
+    texture, render = (
+        albedo(truth, np.random.default_rng(0)),
+        Render(samples_per_pixel=36, max_depth=3, light="separated"),
+    )
+    depths, around = (0.45, 0.55, 0.4, 0.5), ((-2, -1.2), (2, 1), (1.8, -1.4), (-1.6, 1.5))
+    presses = [press_ball(truth, 3.0, *each, 0.5) for each in zip(depths, np.array(around), strict=True)]
+    still = presses[0].surface
+    faces = [(still, still.material)] * 3 + [(press.surface, press.positions) for press in presses]
+    for number, (surface, positions) in enumerate(faces):
+        radiance = Renderer(truth, render, surface, texture, FAST).radiance(positions, number)
+        image = camera_image(radiance, truth.camera, np.random.default_rng(number))
+        cv2.imwrite(str(tmp_path / f"{number}.png"), image[:, :, ::-1])
+    sensor = start.model_dump(mode="json", exclude={"further_cameras", "mirrors"}, exclude_none=True)
+    content = {"name": "start", "sensor": sensor, "motion": {"depth_mm": 0.4, "steps": 1},
+               "contact": {"indenter": {"shape": "sphere", "radius_mm": 3.0}, "friction": 0.5},
+               "render": {"light": "separated", "max_depth": 3, "samples_per_pixel": 16}}  # fmt: skip
+    (tmp_path / "start.toml").write_text(tomli_w.dumps(content))
+    rest, fitted = ([tmp_path / f"{k}.png" for k in numbers] for numbers in ((0, 1, 2), (3, 4, 5)))
+    given = ["--frames", *rest, "--ball", *fitted, "--judge-ball", tmp_path / "6.png", "--radius-mm", 3]
+    out = tmp_path / "fit"
+    said(capsys, main, "calibrate", "--scene", tmp_path / "start.toml", *given, "--steps", 16, "--out", out)
+    record = json.loads((out / "calibration.json").read_text())
+    places = np.array([light["position_mm"] for light in record["lights"]])
+    powers = np.array([max(light["power_per_channel"]) for light in record["lights"]])
+    own = np.array([light.position_mm for light in truth.lights])
+    turned = np.degrees(np.arctan2(places[:, 1], places[:, 0])) - azimuths
+    assert np.abs((turned + 180) % 360 - 180).max() < 5  # the bounds that calibration is to keep
+    raised = np.subtract(*(np.degrees(np.arctan2(each[:, 2], np.hypot(*each[:, :2].T))) for each in (places, own)))
+    assert np.abs(raised).max() < 10
+    assert powers == pytest.approx([light.power for light in truth.lights], rel=0.1)
+    assert [Path(contact["frame"]).stem for contact in record["contacts"]] == ["3", "4", "5", "6"]
+    for contact in record["contacts"]:
+        assert max(contact["rms_within"]) < 6  # levels: as between frames, the camera's noise is 2
+        assert np.abs(np.subtract(*contact["azimuth_deg"].values())).max() < 5
+    assert record["verdict"]["good"]
