@@ -116,14 +116,21 @@ def test_markers_need_no_grid_and_a_dead_one_disturbs_no_other() -> None:
 
 
 def test_the_network_takes_over_where_the_stream_is_lost(monkeypatch) -> None:
+    """A turn by 14 degrees at once: at the border, dots move by more than half their distance."""
     tracker = gelflow.Tracker(frame(), weights="best")
-    asked = []
-    network = tracker._network.flow
-    monkeypatch.setattr(tracker._network, "flow", lambda *images: asked.append(1) or network(*images))
+    network, asked = tracker._network, []
+    monkeypatch.setattr(tracker, "_network", lambda *images: asked.append(1) or network(*images))
     for number in range(1, 4):
         motion = Turn(shift=(2.0 * number, 0.0))
         assert off(tracker.update(motion.frame(*SIZE, DOTS)).flow, motion) < 0.1
-    assert len(asked) == 1
+    assert not asked
+    motion = Turn(14.0, shift=(2.0, 0.0))
+    found = tracker.update(motion.frame(*SIZE, DOTS))
+    assert asked
+    assert found.afresh
+    truth = motion.flow(*SIZE)
+    wrong = np.hypot(*np.moveaxis(found.flow - truth, -1, 0)) > PITCH / 2
+    assert wrong[found.sigma < 1].mean() < 0.01
 
 
 @pytest.mark.parametrize("weights", [["--weights", "fast"], ["--method", "farneback"]])
