@@ -117,10 +117,10 @@ def refined(flow: FlowArray, first: Prepared, second: Prepared, before: Refined 
     square = RADIUS**2 / 2 * (error + (CURVATURE * CELL**2 * moment).square() * curvature_square(best, CELL))
     fitted, sigma = best[0].movedim(0, -1).contiguous().numpy(), square.clamp(max=MAX_SIGMA_PX**2).sqrt()[0, 0].numpy()
     lost, inner, torn = _cut(fitted, sigma, first, second)
-    known = _largest_part(inner)
+    trusted = _largest_part(inner)
     if before is not None:
-        known |= inner & before.known & (np.linalg.norm(fitted - before.flow, axis=-1) < NO_JUMP_PX)
-    return Refined(fitted, np.where(known, sigma, np.float32(MAX_SIGMA_PX)), known, lost, torn)
+        trusted |= inner & before.known & (np.linalg.norm(fitted - before.flow, axis=-1) < NO_JUMP_PX)
+    return Refined(fitted, np.where(trusted, sigma, np.float32(MAX_SIGMA_PX)), trusted, lost, torn)
 
 
 def doubted(flow: FlowArray, sigma: MapArray, image1: ImageArray, image2: ImageArray) -> MapArray:
@@ -147,8 +147,10 @@ def _cut(
 
 def _strain(flow: FlowArray) -> MapArray:
     """The norm of Green's strain (F^T F - 1) / 2 of a flow on cells, F = 1 + grad V; (h, w)."""
-    gradient = np.stack(np.gradient(flow, CELL, axis=(1, 0)), axis=-1) + np.eye(2, dtype=np.float32)
-    return np.linalg.norm(np.swapaxes(gradient, -1, -2) @ gradient - np.eye(2), axis=(-2, -1)) / 2
+    down, across = np.gradient(flow, CELL, axis=(0, 1))
+    gradient = np.stack([across, down], axis=-1) + np.eye(2, dtype=np.float32)
+    square = np.swapaxes(gradient, -1, -2) @ gradient
+    return np.asarray(np.linalg.norm(square - np.eye(2), axis=(-2, -1)) / 2, np.float32)
 
 
 def _largest_part(inner: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -17,10 +17,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 
 from gelflow.arrays import FlowArray, Grey8, ImageArray
 from gelflow.fast.registration import CONFIG, STAGES, Prepared, register, resized, unexplained
-from gelflow.models.weights import weights_file
+from gelflow.models.estimate import estimate_flow
+from gelflow.models.weights import load_weights, weights_file
 
 Network = Callable[[ImageArray, ImageArray], FlowArray]
 """Gives the flow between two images of one size; `gelflow.baselines.method.Method.flow`."""
@@ -66,9 +68,14 @@ def torn(flow: FlowArray, first: Prepared, second: Prepared) -> float:
 
 @functools.cache
 def _shipped() -> Network:
-    from gelflow.baselines.learned import Learned  # a module that knows this one
+    model = load_weights(weights_file(None))
+    model.config = model.config.model_copy(update={"registration": None})
 
-    return Learned(weights_file(None), device="cpu", registration="none").flow
+    def flow(image1: ImageArray, image2: ImageArray) -> FlowArray:
+        one, other = (torch.from_numpy(image).movedim(-1, 0).contiguous()[None] for image in (image1, image2))
+        return np.ascontiguousarray(estimate_flow(model, one, other)[0].movedim(0, -1).numpy())
+
+    return flow
 
 
 def best_of(flows: Sequence[FlowArray], first: Prepared, second: Prepared) -> FlowArray:
