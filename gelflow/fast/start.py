@@ -37,6 +37,8 @@ MOST_UNEXPLAINED = 1e-3
 TORN, MOST_TORN = 0.3, 0.01
 """Share of the residual of unrelated images above which a flow tears the picture, and share of the picture that may be
 torn before a network is asked. No flow with a jump tore less than 0.018, two of 113 without one tore more than 0.01."""
+UNRELATED = 0.9
+"""Share of the picture that is torn where one image has nothing to do with the other, so that no network helps."""
 
 
 def fresh_start(
@@ -54,7 +56,7 @@ def fresh_start(
         medium = register(dis("medium", first.grey, second.grey), first, second, widest)
         flow = best_of([flow, medium], first, second)
     left = torn(flow, first, second)
-    if left > MOST_TORN:
+    if MOST_TORN < left < UNRELATED:
         asked = register((network or _shipped())(first.whole, second.whole), first, second, widest)
         flow = asked if torn(asked, first, second) < left else flow
     return flow

@@ -1,7 +1,8 @@
 """Markers: dots, blobs or pins of the reference, moved by the flow. No grid is assumed, and none is fitted.
 
 Each marker is read from the flow at its own centre, so that a missing or broken one disturbs no other. It is visible
-where it stays in the image, sigma is known, and the two images resemble each other in a window of its own size.
+where it stays in the image, sigma is known, the two images resemble each other in a window of its own size, and no
+surer marker is at the same place.
 """
 
 from collections.abc import Iterable, Iterator
@@ -10,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from gelflow.arrays import Estimate, ImageArray, MapArray
 from gelflow.fast.registration import indices, resized
@@ -63,6 +65,9 @@ class Markers:
         likeness = resized(_likeness(self._reference, moved, self._deviation), grey.shape)
         known = markers["sigma"] < unknown_px(*found.sigma.shape)
         markers["visible"] = known & (read(found.visible) > 0.5) & (read(likeness) > MIN_LIKENESS)
+        ends = np.nan_to_num(np.stack([markers["x"] + markers["u"], markers["y"] + markers["v"]], axis=-1))
+        for pair in KDTree(ends).query_pairs(self._deviation):
+            markers["visible"][max(pair, key=lambda one: markers["sigma"][one])] = False
         return markers
 
 

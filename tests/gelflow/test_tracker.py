@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 from textures import as_bytes, moved, table, write_video
 
 import gelflow
+from gelflow.arrays import Estimate
 from gelflow.cli import main
+from gelflow.fast import start
+from gelflow.track.markers import Markers
 
 SIZE = (160, 208)
 DOTS = centres(*SIZE)
@@ -54,6 +57,48 @@ def test_after_a_cut_nothing_is_known_and_the_next_frame_is_found() -> None:
     found = tracker.update(motion.frame(*SIZE, DOTS))
     assert off(found.flow, motion) < 0.1
     assert not tracker.update(motion.frame(*SIZE, DOTS)).afresh
+
+
+def test_a_ramp_of_exposure_is_unknown_asks_no_network_and_the_stream_goes_on(monkeypatch) -> None:
+    monkeypatch.setattr(start, "_shipped", None)
+    tracker = gelflow.Tracker(frame())
+    light = [1.0, 0.15, 0.03, 0.1, 0.9, 1.0, 1.0]
+    found = []
+    for number, factor in enumerate(light):
+        motion = Turn(shift=(1.0 + number, 0.0))
+        found.append(tracker.update((factor * motion.frame(*SIZE, DOTS)).astype(np.uint8)))
+    assert [float((each.sigma < 1).mean()) > 0.5 for each in found] == [factor > 0.5 for factor in light]
+    assert off(found[-1].flow, motion) < 0.1
+    assert not found[-1].afresh
+
+
+def test_a_stream_that_begins_in_contact_counts_motion_from_there() -> None:
+    tracker = gelflow.Tracker(frame(turn=3.0, shift=(4.0, 0.0)))
+    found = tracker.update(frame(turn=3.0, shift=(6.0, 0.0)))
+    inner = found.flow[20:-20, 20:-20]
+    assert np.abs(np.median(inner, axis=(0, 1)) - (2, 0)).max() < 0.1
+
+
+def test_frames_of_another_kind_are_taken_if_they_show_the_same() -> None:
+    tracker, motion = gelflow.Tracker(frame()), Turn(shift=(2.0, 0.0))
+    image = motion.frame(*SIZE, DOTS)
+    for same in (image, image.astype(np.float32) / 255, image.astype(np.uint16) * 257, image[..., [0, 1, 2, 2]]):
+        assert off(tracker.update(same).flow, motion) < 0.1
+
+
+def test_of_two_markers_at_one_place_only_the_surer_one_is_seen() -> None:
+    image = frame().astype(np.float32) / 255
+    markers = Markers(image)
+    still = Estimate(np.zeros((*SIZE, 2), np.float32), np.full(SIZE, 0.1, np.float32), np.ones(SIZE, np.float32))
+    rest = markers.at(still, image)
+    one, other = np.argsort(np.hypot(rest["x"] - SIZE[1] / 2, rest["y"] - SIZE[0] / 2))[:2]
+    row, column = np.indices(SIZE) + 0.5
+    near = np.hypot(column - rest["x"][one], row - rest["y"][one]) < 8
+    still.flow[near] = [rest["x"][other] - rest["x"][one], rest["y"][other] - rest["y"][one]]
+    still.sigma[near] = 0.2
+    moved = markers.at(still, image)
+    assert rest["visible"].all()
+    assert list(np.flatnonzero(~moved["visible"])) == [one]
 
 
 def test_wrong_frames_and_times_are_refused_and_leave_no_trace() -> None:
