@@ -11,7 +11,7 @@ import time
 from contextlib import closing, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -32,6 +32,8 @@ from gelflow.errors import InputError, printable
 
 if TYPE_CHECKING:
     from gelflow.baselines import Method
+    from gelflow.predict.live import LiveFlow
+    from gelflow.predict.page import Page
     from gelflow.predict.prediction import Motion, Prediction
 
 SCALE_DECAY = 0.97
@@ -105,6 +107,9 @@ def live(
     markers: Annotated[
         Path | None, Parameter(help="File to write the motion of the first frame's dots to, as it comes (CSV).")
     ] = None,
+    out: Annotated[
+        Path | None, Parameter(help="Folder to record flow (EXR) and motion.csv to, as predict does.")
+    ] = None,
     size: Size = None,
     device: OnDevice = "auto",
     port: Annotated[int | None, Parameter(converter=whole(0), help="Show the flow at http://127.0.0.1:PORT.")] = None,
@@ -115,10 +120,12 @@ def live(
 ) -> int:
     """Prints the motion of a running camera, a line for each frame, until the camera or Ctrl-C ends it.
 
-    Frames that come while one is computed are left out. With --json each line is JSON.
+    Frames that come while one is computed are left out. A camera that goes away is waited for. With --json each line is
+    JSON. The last line, on stderr, says latency and rate of the last 300 frames.
     """
-    from gelflow.predict.live import Page, follow
-    from gelflow.predict.pictures import certain, draw_overlay, robust_scale, round_up
+    from gelflow.predict.live import Pace, follow
+    from gelflow.predict.page import Page
+    from gelflow.predict.recording import Recording
     from gelflow.track.markers import COLUMNS, marker_rows
 
     if not seconds >= 0:
@@ -127,28 +134,33 @@ def live(
     page = None if port is None else Page(port)
     if page:
         print(f"gelflow: {estimator.name} at {page.address}", file=sys.stderr, flush=True)
-    scale, started = 0.0, time.perf_counter()
-    before = started
+    pace, measured, started = Pace(), dict[str, float](), time.perf_counter()
+    marked = markers is not None or (page is not None and reference == "first")
+    scale = 0.0
     try:
         with (
-            closing(follow(estimator, source, reference, markers is not None)) as flows,
+            closing(follow(estimator, source, reference, marked)) as flows,
             nullcontext() if markers is None else markers.open("w", newline="", encoding="utf-8") as table,
+            nullcontext() if out is None else closing(Recording(out)) as recording,
         ):
             if table:
                 csv.writer(table).writerow(COLUMNS)
-            for frame, found, motion, moved in flows:
-                if table and moved is not None:
-                    csv.writer(table).writerows(marker_rows(motion.frame, motion.time_s, moved))
+            for flow in flows:
+                measured = pace.add(flow)
+                motion = flow.motion
+                if recording:
+                    recording.add(flow.found, motion)
+                if table and flow.markers is not None:
+                    csv.writer(table).writerows(marker_rows(motion.frame, motion.time_s, flow.markers))
                     table.flush()
                 if page:
-                    known = certain(found.flow, found.sigma)
-                    scale = max(SCALE_DECAY * scale, robust_scale(known))
-                    page.show(draw_overlay(frame, known, round_up(scale)))
-                now = time.perf_counter()
-                text = f"{_words(motion)}; {1 / (now - before):.1f} frames/s"
-                print(json.dumps(asdict(motion)) if as_json else f"frame {motion.frame}: {text}", flush=True)
-                before = now
-                if now - started >= seconds:
+                    scale = show_live(page, flow, measured, scale)
+                line = {**asdict(motion), **measured}
+                print(
+                    json.dumps(line) if as_json else f"frame {motion.frame}: {_words(motion)}; {_pace(measured)}",
+                    flush=True,
+                )
+                if time.perf_counter() - started >= seconds:
                     break
     except KeyboardInterrupt:
         pass
@@ -157,7 +169,38 @@ def live(
     finally:
         if page:
             page.close()
+    if measured:
+        median, most = (1e3 * measured[name] for name in ("latency_median_s", "latency_95_s"))
+        rate = f"{measured['frames_per_s']:.1f} frames/s, {measured['left_out']} left out"
+        print(f"gelflow: latency {median:.0f} ms in the median, {most:.0f} ms at 95 %; {rate}", file=sys.stderr)
     return 0
+
+
+def _pace(measured: dict[str, float]) -> str:
+    return f"{1e3 * measured['latency_s']:.0f} ms after the frame; {measured['frames_per_s']:.1f} frames/s"
+
+
+def show_live(page: Page, flow: LiveFlow, measured: dict[str, float], scale: float) -> float:
+    """Shows a frame; the scale of its picture, px."""
+    from gelflow.models.working_size import unknown_px
+    from gelflow.predict.pictures import certain, draw_markers, draw_overlay, draw_sigma, robust_scale, round_up
+
+    known = certain(flow.found.flow, flow.found.sigma)
+    scale = max(SCALE_DECAY * scale, robust_scale(known))
+    frame, rows = flow.frame, []
+    if flow.markers is not None:
+        frame = draw_markers(frame, flow.markers)
+        names = flow.markers.dtype.names or ()
+        rows = [dict(zip(names, map(_finite, marker.item()), strict=True)) for marker in flow.markers]
+    state = {name: _finite(value) for name, value in {**asdict(flow.motion), **measured}.items()}
+    sigma = draw_sigma(flow.found.sigma, unknown_px(*flow.found.sigma.shape))
+    page.show(draw_overlay(frame, known, round_up(scale)), sigma, {**state, "markers": rows})
+    return scale
+
+
+def _finite(value: Any) -> Any:
+    """A number that JSON has, or None."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _estimator(

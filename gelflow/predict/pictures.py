@@ -113,6 +113,23 @@ def draw_overlay(frame: Bytes3, flow: FlowArray, scale_px: float) -> Bytes3:
     return np.ascontiguousarray(picture[: picture.shape[0] // 2 * 2])
 
 
+def draw_sigma(sigma: MapArray, unknown: float) -> Bytes3:
+    """Sigma as a picture (H, W, 3): dark at 0, bright below, and grey from `unknown` px on."""
+    share = (sigma / unknown).clip(0, 1)
+    picture = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1].copy()
+    picture[share >= 1] = UNKNOWN_COLOUR
+    return picture
+
+
+def draw_markers(frame: Bytes3, markers: NDArray[np.void]) -> Bytes3:
+    """A frame with a circle at each marker that is seen in it."""
+    drawn = frame.copy()
+    for marker in markers[markers["visible"]]:
+        place = round(float(marker["x"] + marker["u"]) - 0.5), round(float(marker["y"] + marker["v"]) - 0.5)
+        cv2.circle(drawn, place, 3, (0, 255, 0), 1)
+    return drawn
+
+
 def arrow_factor(scale_px: float) -> float:
     """Enlargement of arrows: the smallest power of ten (1 at least) that makes the scale 3 px long or more."""
     factor = 1.0

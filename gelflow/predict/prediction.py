@@ -24,7 +24,7 @@ from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
 from gelflow.models.working_size import unknown_px
 from gelflow.predict.pictures import certain, draw_overlay, robust_scale, write_flow_picture
-from gelflow.predict.stream import Reference, Stream
+from gelflow.predict.stream import Indexed, Reference, followed
 from gelflow.track.markers import COLUMNS, marker_rows
 
 MAX_RATE = 600.0
@@ -52,6 +52,9 @@ class Motion:
     p99_px: float
     compute_s: float
     unknown: float
+
+
+MOTION_COLUMNS = [column.name for column in fields(Motion)]
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,7 @@ def _predicted(method: Method, dataset: PairDataset, index: int, out: Path) -> t
 
 
 def _write_motions(out: Path, motions: list[Motion]) -> Path:
-    write_csv(out / MOTIONS, [column.name for column in fields(Motion)], map(astuple, motions))
+    write_csv(out / MOTIONS, MOTION_COLUMNS, map(astuple, motions))
     return out / MOTIONS
 
 
@@ -142,31 +145,31 @@ def predict_video(
     video = out / "overlay.mp4"
     refuse_foreign(out / MOTIONS, MOTIONS_BEGIN, video)
     refuse_foreign(out / MARKERS, MARKERS_BEGIN)
-    for earlier in _earlier_flows(out):
+    for earlier in earlier_flows(out):
         refuse_foreign(earlier, DIRECTIONS.encode())
     sources = dict(enumerate(image_files(path))) if path.is_dir() else {}
     files: list[Path] = []
     motions: list[Motion] = []
     times: list[float] = []
     marked: list[tuple[int, float | None, NDArray[Any]]] = []
-    scale, stream = 0.0, None
-    for index, time_s, frame in _frames(path, every):
-        times.append(index / info.frames_per_second if time_s is None else time_s)
-        source = sources.get(index, path)
-        try:
-            if stream is None:
-                stream = Stream(method, frame, reference, markers)
-                continue
-            found, seconds, moved = stream.update(frame)
-        except InputError as error:
-            raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
-        motion = motion_of(found, index, source.name, time_s, seconds)
+    scale = 0.0
+
+    def timed() -> Iterator[Indexed]:
+        for index, time_s, frame in _frames(path, every):
+            times.append(index / info.frames_per_second if time_s is None else time_s)
+            yield index, time_s, frame
+
+    def named(index: int) -> Path:
+        return sources.get(index, path)
+
+    for (index, time_s, _), (found, seconds, moved) in followed(method, timed(), named, reference, markers):
+        motion = motion_of(found, index, named(index).name, time_s, seconds)
         if moved is not None:
             marked.append((index, time_s, moved))
         if not files:
-            for earlier in _earlier_flows(out):
+            for earlier in earlier_flows(out):
                 earlier.unlink()
-        files.append(out / "flow" / f"{index:06d}.exr")
+        files.append(flow_file(out, index))
         write_flow(files[-1], found.flow, found.visible, found.sigma)
         motions.append(motion)
         scale = max(scale, robust_scale(certain(found.flow, found.sigma)))
@@ -184,7 +187,7 @@ def predict_video(
         for count, (index, _, frame) in enumerate(_frames(path, every), len(motions)):
             flow = np.zeros((*frame.shape[:2], 2), np.float32)
             if index > 0:
-                field = read_flow(out / "flow" / f"{index:06d}.exr")
+                field = read_flow(flow_file(out, index))
                 flow = certain(field.flow, field.sigma)
             image = in_unit_range(frame)
             yield draw_overlay(to_bytes(full_range(image, image)[0]), flow, scale)
@@ -248,6 +251,11 @@ def _write_overlay(pictures: Iterator[Bytes3], video: Path, places: list[int], r
         temporary.unlink(missing_ok=True)
 
 
-def _earlier_flows(out: Path) -> list[Path]:
+def flow_file(out: Path, index: int) -> Path:
+    """The file of the flow to a frame."""
+    return out / "flow" / f"{index:06d}.exr"
+
+
+def earlier_flows(out: Path) -> list[Path]:
     """What an earlier run wrote, which may have had other frames: files named by six digits or more."""
     return [path for path in (out / "flow").glob("*.exr") if re.fullmatch(r"[0-9]{6,}", path.stem)]

@@ -1,5 +1,7 @@
 """Frames of a recording or a camera, one after the other: the flow to each, and the markers that move with it."""
 
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from numpy.typing import NDArray
@@ -51,3 +53,31 @@ class Stream:
         if self._reference == "previous":
             self._before = frame
         return Followed(found, seconds, None if self._markers is None else self._markers.at(found, images[1]))
+
+
+Indexed = tuple[int, float | None, Frame]
+"""A frame's number, its time, s, where it has one, and its pixels."""
+
+
+def followed(
+    method: Method,
+    frames: Iterable[Indexed],
+    named: Callable[[int], str | Path],
+    reference: Reference = "first",
+    markers: bool = False,
+) -> Iterator[tuple[Indexed, Followed]]:
+    """Yields each frame but the first with what was found in it.
+
+    InputError where a frame cannot be used, which says what `named` gives for its number.
+    """
+    stream: Stream | None = None
+    for each in frames:
+        index, _, frame = each
+        try:
+            if stream is None:
+                stream = Stream(method, frame, reference, markers)
+                continue
+            found = stream.update(frame)
+        except InputError as error:
+            raise InputError(f"{named(index)}, frame {index}, {method.name}: {error}") from error
+        yield each, found

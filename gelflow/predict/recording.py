@@ -1,0 +1,62 @@
+"""Recording of a running camera, in the files of `predict`: flow/000001.exr ... and motion.csv.
+
+Files are written beside the flow's computation, so that it need not wait for a disk, unless that falls behind.
+"""
+
+import csv
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import astuple
+from pathlib import Path
+
+from gelflow.arrays import Estimate
+from gelflow.files.atomic import refuse_foreign
+from gelflow.files.exr import DIRECTIONS, write_flow
+from gelflow.predict.prediction import (
+    MOTION_COLUMNS,
+    MOTIONS,
+    MOTIONS_BEGIN,
+    Motion,
+    earlier_flows,
+    flow_file,
+)
+
+MOST_PENDING = 8
+"""Frames that may wait to be written."""
+
+
+class Recording:
+    """Replaces an earlier run's files in a folder.
+
+    InputError where files of these names are somebody else's; OSError, also from `add`, where one cannot be written.
+    """
+
+    def __init__(self, out: Path) -> None:
+        refuse_foreign(out / MOTIONS, MOTIONS_BEGIN)
+        for earlier in earlier_flows(out):
+            refuse_foreign(earlier, DIRECTIONS.encode())
+            earlier.unlink()
+        out.mkdir(parents=True, exist_ok=True)
+        self._out = out
+        self._table = (out / MOTIONS).open("w", newline="", encoding="utf-8")
+        csv.writer(self._table).writerow(MOTION_COLUMNS)
+        self._writer = ThreadPoolExecutor(1)
+        self._pending: deque[Future[None]] = deque()
+
+    def add(self, found: Estimate, motion: Motion) -> None:
+        """Writes the flow to a frame, and its motion; waits where too many frames do."""
+        self._pending.append(self._writer.submit(self._write, found, motion))
+        while self._pending and (len(self._pending) > MOST_PENDING or self._pending[0].done()):
+            self._pending.popleft().result()
+
+    def close(self) -> None:
+        """Waits for what is still to be written."""
+        self._writer.shutdown()
+        self._table.close()
+        for each in self._pending:
+            each.result()
+
+    def _write(self, found: Estimate, motion: Motion) -> None:
+        write_flow(flow_file(self._out, motion.frame), found.flow, found.visible, found.sigma)
+        csv.writer(self._table).writerow(astuple(motion))
+        self._table.flush()
