@@ -21,6 +21,7 @@ from gelflow.cli.options import (
     Device,
     OnDevice,
     Out,
+    Places,
     Registered,
     Registration,
     ShippedOrFile,
@@ -31,6 +32,7 @@ from gelflow.cli.options import (
 from gelflow.errors import InputError, printable
 
 if TYPE_CHECKING:
+    from gelflow.arrays import FlowArray
     from gelflow.baselines import Method
     from gelflow.predict.live import LiveFlow
     from gelflow.predict.page import Page
@@ -56,6 +58,7 @@ def predict(
     markers: Annotated[
         bool, Parameter(negative=(), help="Of a video: write the motion of the first frame's dots to markers.csv.")
     ] = False,
+    scene: Places = None,
     size: Size = None,
     device: OnDevice = "auto",
     as_json: AsJson = False,
@@ -73,6 +76,7 @@ def predict(
     for path in inputs:
         if not path.exists():
             raise InputError(f"{path}: there is no such file or folder")
+    places = _places(scene, markers)
     estimator = _estimator(weights, method, registration, size, device)
     paired = len(inputs) == 2 or holds_pairs(inputs[0])
     if paired and (reference, every, markers) != ("first", 1, False):
@@ -85,7 +89,7 @@ def predict(
     else:
         with progress("frames, then overlay", not as_json) as advance:
             result = predict_video(
-                estimator, inputs[0], out, reference, every, lambda n, total: advance(n, total, ""), markers
+                estimator, inputs[0], out, reference, every, lambda n, total: advance(n, total, ""), markers, places
             )
     if result.lost:
         words = f"about {result.lost} frames at its end do not decode (truncated or damaged)"
@@ -110,6 +114,7 @@ def live(
     out: Annotated[
         Path | None, Parameter(help="Folder to record flow (EXR) and motion.csv to, as predict does.")
     ] = None,
+    scene: Places = None,
     size: Size = None,
     device: OnDevice = "auto",
     port: Annotated[int | None, Parameter(converter=whole(0), help="Show the flow at http://127.0.0.1:PORT.")] = None,
@@ -126,10 +131,11 @@ def live(
     from gelflow.predict.live import Pace, follow
     from gelflow.predict.page import Page
     from gelflow.predict.recording import Recording
-    from gelflow.track.markers import COLUMNS, marker_rows
+    from gelflow.track.markers import marker_rows, marker_table
 
     if not seconds >= 0:
         raise InputError(f"--seconds {seconds:g}: allowed are 0 and more")
+    places = _places(scene, markers is not None)
     estimator = _estimator(weights, method, registration, size, device)
     page = None if port is None else Page(port)
     if page:
@@ -139,19 +145,19 @@ def live(
     scale = 0.0
     try:
         with (
-            closing(follow(estimator, source, reference, marked)) as flows,
+            closing(follow(estimator, source, reference, marked, places)) as flows,
             nullcontext() if markers is None else markers.open("w", newline="", encoding="utf-8") as table,
             nullcontext() if out is None else closing(Recording(out)) as recording,
         ):
             if table:
-                csv.writer(table).writerow(COLUMNS)
+                csv.writer(table).writerow(marker_table(places))
             for flow in flows:
                 measured = pace.add(flow)
                 motion = flow.motion
                 if recording:
                     recording.add(flow.found, motion)
                 if table and flow.markers is not None:
-                    csv.writer(table).writerows(marker_rows(motion.frame, motion.time_s, flow.markers))
+                    csv.writer(table).writerows(marker_rows(motion.frame, motion.time_s, flow.markers, places))
                     table.flush()
                 if page:
                     scale = show_live(page, flow, measured, scale)
@@ -201,6 +207,15 @@ def show_live(page: Page, flow: LiveFlow, measured: dict[str, float], scale: flo
 def _finite(value: Any) -> Any:
     """A number that JSON has, or None."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _places(scene: Path | None, markers: bool) -> FlowArray | None:
+    """The places of a file that --scene names; InputError without --markers."""
+    from gelflow.track.places import read_places
+
+    if scene is not None and not markers:
+        raise InputError("--scene: is for --markers, whose numbers are then in mm; give both")
+    return None if scene is None else read_places(scene)
 
 
 def _estimator(

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.arrays import Bytes3, Estimate
+from gelflow.arrays import Bytes3, Estimate, FlowArray
 from gelflow.baselines.method import Method
 from gelflow.errors import InputError
 from gelflow.files.image import full_range, in_unit_range, to_bytes
@@ -37,12 +37,16 @@ class LiveFlow(NamedTuple):
 
 
 def follow(
-    method: Method, source: str, reference: Reference = "first", markers: bool = False
+    method: Method,
+    source: str,
+    reference: Reference = "first",
+    markers: bool = False,
+    places: FlowArray | None = None,
 ) -> Generator[LiveFlow, None, None]:
     """Yields the flow to each newest frame, from the first frame or from the one that was used before.
 
-    The source is as `newest_frames` takes it. InputError where it does not open or gives fewer than two frames, its
-    frames change their size, or the method cannot use them.
+    The source is as `newest_frames` takes it, the rest as for `followed`. InputError where it does not open or gives
+    fewer than two frames, its frames change their size, or the method cannot use them.
     """
     arrivals: deque[tuple[int, float]] = deque(maxlen=2)
     with closing(newest_frames(source)) as newest:
@@ -53,7 +57,7 @@ def follow(
                 yield index, time_s, frame
 
         for (index, time_s, frame), (found, seconds, moved) in followed(
-            method, noted(), lambda _: source, reference, markers
+            method, noted(), lambda _: source, reference, markers, places
         ):
             latency_s = time.monotonic() - arrivals[-1][1]
             left_out = index - arrivals[0][0] - 1

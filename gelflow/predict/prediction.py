@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.arrays import Bytes3, Estimate, Frame
+from gelflow.arrays import Bytes3, Estimate, FlowArray, Frame
 from gelflow.baselines.method import Method, estimated
 from gelflow.data.pairs import PairDataset, PairRecord
 from gelflow.errors import InputError
@@ -25,13 +25,13 @@ from gelflow.files.video import describe, frame_file, frames, image_files
 from gelflow.models.working_size import unknown_px
 from gelflow.predict.pictures import certain, draw_overlay, robust_scale, write_flow_picture
 from gelflow.predict.stream import Indexed, Reference, followed
-from gelflow.track.markers import COLUMNS, marker_rows
+from gelflow.track.markers import marker_rows, marker_table
 
 MAX_RATE = 600.0
 """Largest number of frames per second of an overlay."""
 MOTIONS, MOTIONS_BEGIN = "motion.csv", b"mean_px,p95_px"
 """The table of motions, and what tells it from other tables."""
-MARKERS, MARKERS_BEGIN = "markers.csv", ",".join(COLUMNS).encode()
+MARKERS, MARKERS_BEGIN = "markers.csv", b"id,frame,time_s,x"
 """The table of markers, likewise."""
 
 
@@ -124,11 +124,13 @@ def predict_video(
     every: int = 1,
     progress: Callable[[int, int], None] | None = None,
     markers: bool = False,
+    places: FlowArray | None = None,
 ) -> Prediction:
     """Writes flow/000001.exr ... (numbered by frame), motion.csv and overlay.mp4 in place of an earlier run's.
 
     Every `every`-th frame of a video file or a folder of images is taken; the flow leads to it from the first one or
-    from its predecessor. With `markers`, markers.csv holds those of the first frame in each other. `progress` is called
+    from its predecessor. With `markers`, markers.csv holds those of the first frame in each other, in mm where `places`
+    (`gelflow.track.places`) are given. `progress` is called
     with the number of frames done and to be done; each counts twice, for flow and overlay. InputError where the video
     does not open, fewer than two frames decode, a frame cannot be used, or files of these names are somebody else's;
     OSError where a file cannot be written.
@@ -162,7 +164,7 @@ def predict_video(
     def named(index: int) -> Path:
         return sources.get(index, path)
 
-    for (index, time_s, _), (found, seconds, moved) in followed(method, timed(), named, reference, markers):
+    for (index, time_s, _), (found, seconds, moved) in followed(method, timed(), named, reference, markers, places):
         motion = motion_of(found, index, named(index).name, time_s, seconds)
         if moved is not None:
             marked.append((index, time_s, moved))
@@ -177,8 +179,8 @@ def predict_video(
             progress(len(motions), 2 * expected)
     tables = [_write_motions(out, motions)]
     if markers:
-        rows = (row for index, time_s, moved in marked for row in marker_rows(index, time_s, moved))
-        write_csv(out / MARKERS, COLUMNS, rows)
+        rows = (row for index, time_s, moved in marked for row in marker_rows(index, time_s, moved, places))
+        write_csv(out / MARKERS, marker_table(places), rows)
         tables.append(out / MARKERS)
     elif (out / MARKERS).exists():
         (out / MARKERS).unlink()

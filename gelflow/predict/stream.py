@@ -6,7 +6,7 @@ from typing import Any, Literal, NamedTuple
 
 from numpy.typing import NDArray
 
-from gelflow.arrays import Estimate, Frame
+from gelflow.arrays import Estimate, FlowArray, Frame
 from gelflow.baselines.method import Method, estimated
 from gelflow.errors import InputError
 from gelflow.fast.method import Fast
@@ -65,15 +65,20 @@ def followed(
     named: Callable[[int], str | Path],
     reference: Reference = "first",
     markers: bool = False,
+    places: FlowArray | None = None,
 ) -> Iterator[tuple[Indexed, Followed]]:
     """Yields each frame but the first with what was found in it.
 
-    InputError where a frame cannot be used, which says what `named` gives for its number.
+    InputError where a frame cannot be used or is not of the size of `places`; it says what `named` gives for the
+    frame's number.
     """
     stream: Stream | None = None
     for each in frames:
         index, _, frame = each
         try:
+            if places is not None and frame.shape[:2] != places.shape[:2]:
+                size = f"{places.shape[1]}x{places.shape[0]}"
+                raise InputError(f"--scene: it has {size} px, the frame {frame.shape[1]}x{frame.shape[0]}")
             if stream is None:
                 stream = Stream(method, frame, reference, markers)
                 continue

@@ -5,7 +5,7 @@ where it stays in the image, sigma is known, the two images resemble each other 
 surer marker is at the same place.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import cv2
@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from gelflow.arrays import Estimate, ImageArray, MapArray
+from gelflow.arrays import Estimate, FlowArray, ImageArray, MapArray
 from gelflow.fast.registration import indices, resized
 from gelflow.files.image import to_grey
 from gelflow.models.working_size import unknown_px
 from gelflow.ops.blobs import SIZES, blob_centre, blobs, inside_by
+from gelflow.track.places import MILLIMETRES, in_millimetres
 
 MARKERS = np.dtype(
     [("id", np.int32), *((name, np.float32) for name in ("x", "y", "u", "v", "sigma")), ("visible", np.bool_)]
@@ -80,8 +81,15 @@ def _likeness(image1: MapArray, image2: MapArray, deviation: float) -> MapArray:
     return 2 * (mixed - mean1 * mean2) / (square - mean1**2 - mean2**2).clip(1e-9)
 
 
-def marker_rows(frame: int, time_s: float | None, markers: Iterable[Any]) -> Iterator[tuple[Any, ...]]:
-    """The rows of `COLUMNS` for the markers of one frame."""
-    for marker in markers:
+def marker_table(places: FlowArray | None) -> Sequence[str]:
+    """The columns of a table of markers, whose numbers are in mm where places are known."""
+    return COLUMNS if places is None else MILLIMETRES
+
+
+def marker_rows(
+    frame: int, time_s: float | None, markers: NDArray[np.void], places: FlowArray | None = None
+) -> Iterator[tuple[Any, ...]]:
+    """The rows of such a table for the markers of one frame."""
+    for marker in markers if places is None else in_millimetres(markers, places):
         numbers = (round(float(marker[name]), 4) for name in COLUMNS[3:-1])
         yield marker["id"], frame, time_s, *numbers, int(marker["visible"])

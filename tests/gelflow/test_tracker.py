@@ -4,6 +4,7 @@ import pickle
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from commands import refused
 from dots import PITCH, Turn, centres
@@ -197,3 +198,39 @@ def test_the_commands_write_markers_as_a_table(tmp_path: Path, weights: list[str
     capsys.readouterr()
     assert main(["predict", str(video), "--out", str(tmp_path), "--markers", "--reference", "previous", *weights]) == 2
     assert "leave out --reference previous" in capsys.readouterr().err
+
+
+def write_places(path: Path, size: tuple[int, int]) -> Path:
+    """A camera's places of 0.05 mm a px along x and 0.1 along y, 1 mm off."""
+    row, column = (np.indices(size) + 0.5).astype(np.float32)
+    planes = {"place.X": 0.05 * column - 1, "place.Y": 0.1 * row - 1}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, planes).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("command", ["predict", "live"])
+def test_with_a_scene_markers_are_in_millimetres(tmp_path: Path, command: str, capsys) -> None:
+    video, scene = tmp_path / "a.avi", write_places(tmp_path / "places.exr", SIZE)
+    write_video(video, [frame(shift=(shift, shift / 2)) for shift in range(4)], 10.0)
+    out = tmp_path / "markers.csv"
+    options = ["--out", tmp_path, "--markers"] if command == "predict" else ["--markers", out]
+    tables = []
+    for further in ([], ["--scene", scene]):
+        assert main([command, str(video), "--weights", "fast", *map(str, [*options, *further])]) == 0
+        tables.append([row for row in table(out) if row["frame"] == "3" and row["visible"] == "1"])
+    pixels, millimetres = tables
+    assert len(pixels) == len(millimetres) > 10
+    for px, mm in zip(pixels, millimetres, strict=True):
+        x, y, u, v, sigma = (float(px[name]) for name in ("x", "y", "u", "v", "sigma"))
+        given = [float(mm[name]) for name in ("x_mm", "y_mm", "u_mm", "v_mm", "sigma_mm")]
+        # Numbers have four digits, and OpenCV reads places in steps of 1/32 px.
+        np.testing.assert_allclose(
+            given, [x / 20 - 1, y / 10 - 1, u / 20, v / 10, sigma / 200**0.5], atol=0.1 / 32 + 1e-4
+        )
+    capsys.readouterr()
+    assert main([command, str(video), *map(str, options), "--scene", str(write_places(scene, (32, 32)))]) == 2
+    assert "--scene: it has 32x32 px, the frame 208x160" in capsys.readouterr().err
+    assert main([command, str(video), *map(str, options), "--scene", str(video)]) == 2
+    assert main([command, str(video), "--out", str(tmp_path), "--scene", str(scene)]) == 2
+    assert "--scene: is for --markers" in capsys.readouterr().err

@@ -1,0 +1,41 @@
+"""Markers in millimetres on the gel's face, by a scene's own optics.
+
+`synth preview --places` writes where each pixel of a scene's camera sees the gel at rest. A marker's place and motion
+are read there, at its pixels before and after; that the gel under it has moved toward the camera is not known here.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.arrays import FlowArray
+from gelflow.errors import InputError
+from gelflow.files.exr import read_channels
+
+MILLIMETRES = ("id", "frame", "time_s", "x_mm", "y_mm", "u_mm", "v_mm", "sigma_mm", "visible")
+"""Columns in place of `gelflow.track.markers.COLUMNS`."""
+
+
+def read_places(path: Path) -> FlowArray:
+    """X and Y of the gel at rest (H, W, 2), mm, NaN where there is none; InputError for another file."""
+    planes = read_channels(path)
+    if not {"place.X", "place.Y"} <= set(planes):
+        raise InputError(f"{path}: has no channels place.X and place.Y; write it by synth preview --places {path.name}")
+    return np.stack([planes["place.X"], planes["place.Y"]], axis=-1)
+
+
+def in_millimetres(markers: NDArray[np.void], places: FlowArray) -> NDArray[np.void]:
+    """Markers whose x, y, u, v and sigma are in mm; NaN where no gel is seen."""
+
+    def at(x: NDArray[np.float32], y: NDArray[np.float32]) -> FlowArray:
+        border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (np.nan, np.nan)}
+        return cv2.remap(places, x[None] - 0.5, y[None] - 0.5, cv2.INTER_LINEAR, **border)[0]
+
+    found, x, y = markers.copy(), markers["x"], markers["y"]
+    across, down = at(x + 0.5, y) - at(x - 0.5, y), at(x, y + 0.5) - at(x, y - 0.5)
+    found["x"], found["y"] = at(x, y).T
+    found["u"], found["v"] = (at(x + markers["u"], y + markers["v"]) - at(x, y)).T
+    found["sigma"] *= np.sqrt(np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]))
+    return found
