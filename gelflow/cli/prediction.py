@@ -11,7 +11,7 @@ import time
 from contextlib import closing, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -126,7 +126,7 @@ def live(
     """Prints the motion of a running camera, a line for each frame, until the camera or Ctrl-C ends it.
 
     Frames that come while one is computed are left out. A camera that goes away is waited for. With --json each line is
-    JSON. The last line, on stderr, says latency and rate of the last 300 frames.
+    JSON. Latency and rate are those of the last 300 frames.
     """
     from gelflow.predict.live import Pace, follow
     from gelflow.predict.page import Page
@@ -140,9 +140,8 @@ def live(
     page = None if port is None else Page(port)
     if page:
         print(f"gelflow: {estimator.name} at {page.address}", file=sys.stderr, flush=True)
-    pace, measured, started = Pace(), dict[str, float](), time.perf_counter()
+    pace, scale, started = Pace(), 0.0, time.perf_counter()
     marked = markers is not None or (page is not None and reference == "first")
-    scale = 0.0
     try:
         with (
             closing(follow(estimator, source, reference, marked, places)) as flows,
@@ -152,20 +151,18 @@ def live(
             if table:
                 csv.writer(table).writerow(marker_table(places))
             for flow in flows:
-                measured = pace.add(flow)
+                pace.add(flow)
                 motion = flow.motion
                 if recording:
                     recording.add(flow.found, motion)
                 if table and flow.markers is not None:
                     csv.writer(table).writerows(marker_rows(motion.frame, motion.time_s, flow.markers, places))
                     table.flush()
+                line = {**asdict(motion), "latency_s": flow.latency_s, "left_out": flow.left_out}
+                words = f"frame {motion.frame}: {_words(motion)}; {pace}"
                 if page:
-                    scale = show_live(page, flow, measured, scale)
-                line = {**asdict(motion), **measured}
-                print(
-                    json.dumps(line) if as_json else f"frame {motion.frame}: {_words(motion)}; {_pace(measured)}",
-                    flush=True,
-                )
+                    scale = show_live(page, flow, words, scale)
+                print(json.dumps(line) if as_json else words, flush=True)
                 if time.perf_counter() - started >= seconds:
                     break
     except KeyboardInterrupt:
@@ -175,38 +172,21 @@ def live(
     finally:
         if page:
             page.close()
-    if measured:
-        median, most = (1e3 * measured[name] for name in ("latency_median_s", "latency_95_s"))
-        rate = f"{measured['frames_per_s']:.1f} frames/s, {measured['left_out']} left out"
-        print(f"gelflow: latency {median:.0f} ms in the median, {most:.0f} ms at 95 %; {rate}", file=sys.stderr)
+    print(f"gelflow: {pace}", file=sys.stderr)
     return 0
 
 
-def _pace(measured: dict[str, float]) -> str:
-    return f"{1e3 * measured['latency_s']:.0f} ms after the frame; {measured['frames_per_s']:.1f} frames/s"
-
-
-def show_live(page: Page, flow: LiveFlow, measured: dict[str, float], scale: float) -> float:
-    """Shows a frame; the scale of its picture, px."""
+def show_live(page: Page, flow: LiveFlow, words: str, scale: float) -> float:
+    """Shows a frame; returns the scale of its picture, px, which goes on from that of the frame before."""
     from gelflow.models.working_size import unknown_px
     from gelflow.predict.pictures import certain, draw_markers, draw_overlay, draw_sigma, robust_scale, round_up
 
     known = certain(flow.found.flow, flow.found.sigma)
     scale = max(SCALE_DECAY * scale, robust_scale(known))
-    frame, rows = flow.frame, []
-    if flow.markers is not None:
-        frame = draw_markers(frame, flow.markers)
-        names = flow.markers.dtype.names or ()
-        rows = [dict(zip(names, map(_finite, marker.item()), strict=True)) for marker in flow.markers]
-    state = {name: _finite(value) for name, value in {**asdict(flow.motion), **measured}.items()}
-    sigma = draw_sigma(flow.found.sigma, unknown_px(*flow.found.sigma.shape))
-    page.show(draw_overlay(frame, known, round_up(scale)), sigma, {**state, "markers": rows})
+    seen = [] if flow.markers is None else [marker.item()[:-1] for marker in flow.markers if marker["visible"]]
+    picture = draw_overlay(draw_markers(flow.frame, seen), known, round_up(scale))
+    page.show(picture, draw_sigma(flow.found.sigma, unknown_px(*flow.found.sigma.shape)), words, seen)
     return scale
-
-
-def _finite(value: Any) -> Any:
-    """A number that JSON has, or None."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _places(scene: Path | None, markers: bool) -> FlowArray | None:

@@ -72,21 +72,18 @@ class Pace:
     """Latency and rate as they were measured over the last `LAST` frames, and the frames left out so far."""
 
     def __init__(self) -> None:
-        self._latencies: deque[float] = deque(maxlen=LAST)
-        self._times: deque[float] = deque(maxlen=LAST)
-        self._left_out = 0
+        self._latencies: deque[tuple[float, float]] = deque(maxlen=LAST)
+        self.left_out = 0
 
-    def add(self, flow: LiveFlow) -> dict[str, float]:
-        """Counts a frame; its latency, median and 95 % of latencies, s, frames per second, and frames left out."""
-        self._latencies.append(flow.latency_s)
-        self._times.append(time.monotonic())
-        self._left_out += flow.left_out
-        median, most = np.percentile(self._latencies, (50, 95))
-        lasted = self._times[-1] - self._times[0]
-        return {
-            "latency_s": flow.latency_s,
-            "latency_median_s": float(median),
-            "latency_95_s": float(most),
-            "frames_per_s": (len(self._times) - 1) / lasted if lasted > 0 else 0.0,
-            "left_out": self._left_out,
-        }
+    def add(self, flow: LiveFlow) -> None:
+        self._latencies.append((flow.latency_s, time.monotonic()))
+        self.left_out += flow.left_out
+
+    def __str__(self) -> str:
+        if not self._latencies:
+            return "no flow"
+        latencies, times = zip(*self._latencies, strict=True)
+        median, most = 1e3 * np.percentile(latencies, (50, 95))
+        rate = (len(times) - 1) / max(times[-1] - times[0], 1e-9)
+        words = f"latency {median:.0f} ms in the median, {most:.0f} ms at 95 %"
+        return f"{words}; {rate:.1f} frames/s, {self.left_out} left out"

@@ -6,6 +6,7 @@ and follows the flow, so that a flow of some hundredths of a px fills the wheel 
 """
 
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -121,12 +122,11 @@ def draw_sigma(sigma: MapArray, unknown: float) -> Bytes3:
     return picture
 
 
-def draw_markers(frame: Bytes3, markers: NDArray[np.void]) -> Bytes3:
-    """A frame with a circle at each marker that is seen in it."""
+def draw_markers(frame: Bytes3, markers: Iterable[tuple[float, ...]]) -> Bytes3:
+    """A frame with a circle at each marker (id, x, y, u, v, ...), px."""
     drawn = frame.copy()
-    for marker in markers[markers["visible"]]:
-        place = round(float(marker["x"] + marker["u"]) - 0.5), round(float(marker["y"] + marker["v"]) - 0.5)
-        cv2.circle(drawn, place, 3, (0, 255, 0), 1)
+    for _, x, y, u, v, *_ in markers:
+        cv2.circle(drawn, (round(x + u - 0.5), round(y + v - 0.5)), 3, (0, 255, 0), 1)
     return drawn
 
 

@@ -1,10 +1,9 @@
 """Recording of a running camera, in the files of `predict`: flow/000001.exr ... and motion.csv.
 
-Files are written beside the flow's computation, so that it need not wait for a disk, unless that falls behind.
+Files are written beside the flow's computation, which waits only if `MOST_PENDING` frames are still to be written.
 """
 
 import csv
-from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import astuple
 from pathlib import Path
@@ -12,17 +11,9 @@ from pathlib import Path
 from gelflow.arrays import Estimate
 from gelflow.files.atomic import refuse_foreign
 from gelflow.files.exr import DIRECTIONS, write_flow
-from gelflow.predict.prediction import (
-    MOTION_COLUMNS,
-    MOTIONS,
-    MOTIONS_BEGIN,
-    Motion,
-    earlier_flows,
-    flow_file,
-)
+from gelflow.predict.prediction import MOTION_COLUMNS, MOTIONS, MOTIONS_BEGIN, Motion, earlier_flows, flow_file
 
 MOST_PENDING = 8
-"""Frames that may wait to be written."""
 
 
 class Recording:
@@ -37,17 +28,15 @@ class Recording:
             refuse_foreign(earlier, DIRECTIONS.encode())
             earlier.unlink()
         out.mkdir(parents=True, exist_ok=True)
-        self._out = out
-        self._table = (out / MOTIONS).open("w", newline="", encoding="utf-8")
+        self._out, self._table = out, (out / MOTIONS).open("w", newline="", encoding="utf-8")
         csv.writer(self._table).writerow(MOTION_COLUMNS)
-        self._writer = ThreadPoolExecutor(1)
-        self._pending: deque[Future[None]] = deque()
+        self._writer, self._pending = ThreadPoolExecutor(1), list[Future[None]]()
 
     def add(self, found: Estimate, motion: Motion) -> None:
-        """Writes the flow to a frame, and its motion; waits where too many frames do."""
+        """Writes the flow to a frame, and its motion."""
         self._pending.append(self._writer.submit(self._write, found, motion))
-        while self._pending and (len(self._pending) > MOST_PENDING or self._pending[0].done()):
-            self._pending.popleft().result()
+        while len(self._pending) > MOST_PENDING:
+            self._pending.pop(0).result()
 
     def close(self) -> None:
         """Waits for what is still to be written."""

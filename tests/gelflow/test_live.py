@@ -1,6 +1,7 @@
 """`live`: the newest frames of a camera, the flow to them, and the page that shows it."""
 
 import json
+import re
 import subprocess
 import sys
 import threading
@@ -72,12 +73,15 @@ class Slow:
 
 def test_latency_and_the_frames_left_out_are_those_that_were(tmp_path: Path) -> None:
     pace, flows = Pace(), list(follow(Slow(), str(video(tmp_path / "a.avi", 20.0))))
-    measured = [pace.add(flow) for flow in flows][-1]
-    assert all(flow.latency_s >= flow.motion.compute_s for flow in flows)
-    assert measured["latency_95_s"] >= measured["latency_median_s"] > 0
-    assert measured["left_out"] > 0
+    for flow in flows:
+        pace.add(flow)
+        assert flow.latency_s >= flow.motion.compute_s
+    assert pace.left_out > 0
     # Frame 0 is the reference.
-    assert measured["left_out"] + len(flows) == flows[-1].motion.frame
+    assert pace.left_out + len(flows) == flows[-1].motion.frame
+    median, most = (int(number) for number in re.findall(r"(\d+) ms", str(pace)))
+    assert most >= median > 0
+    assert f" frames/s, {pace.left_out} left out" in str(pace)
 
 
 class Camera:
@@ -193,10 +197,10 @@ def dotted(shift: float) -> LiveFlow:
     return LiveFlow(frames[1], found, motion_of(found, 1, "camera", 0.1, seconds), markers, seconds, 0)
 
 
-def test_the_page_has_flow_sigma_and_markers_in_numbers_that_json_knows() -> None:
+def test_the_page_has_flow_sigma_and_markers() -> None:
     page, flow = Page(0), dotted(3.0)
     flow.markers[["u", "visible"]][0] = (np.nan, False)
-    show_live(page, flow, Pace().add(flow), 0.0)
+    show_live(page, flow, "some words", 0.0)
     with urlopen(Request(page.address, headers={"Accept": "text/html"}), timeout=10) as answer:
         sources = Elements(answer.read().decode()).sources
     assert set(sources) == {"words", "flow", "sigma", "markers"}
@@ -207,11 +211,9 @@ def test_the_page_has_flow_sigma_and_markers_in_numbers_that_json_knows() -> Non
         assert cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) is not None
     with urlopen(f"{page.address}/state", timeout=10) as answer:
         state = json.loads(answer.read(), parse_constant=pytest.fail)
-    assert len(state["markers"]) == len(flow.markers)
-    seen = [marker["u"] for marker in state["markers"][1:] if marker["visible"]]
-    assert state["markers"][0]["u"] is None
-    assert np.median(seen) == pytest.approx(3, abs=0.1)
-    assert state["left_out"] == 0
+    assert state["words"] == "some words"
+    assert len(state["markers"]) == flow.markers["visible"].sum() < len(flow.markers)
+    assert np.median([u for _, _, _, u, *_ in state["markers"]]) == pytest.approx(3, abs=0.1)
     with pytest.raises(HTTPError, match="404"):
         urlopen(f"{page.address}/elsewhere", timeout=10)
     page.close()
@@ -224,13 +226,14 @@ from PyQt6.QtCore import QTimer, QUrl
 from PyQt6.QtWebEngineWidgets import QWebEngineView
 from PyQt6.QtWidgets import QApplication
 NUMBERS = [
-    "document.querySelectorAll('#markers tr').length", "document.getElementById('flow').naturalWidth",
+    "document.getElementById('markers').textContent.split('\\\\n').length",
+    "document.getElementById('flow').naturalWidth",
     "document.getElementById('sigma').naturalWidth", "document.getElementById('words').textContent",
 ]
 app, view, timer = QApplication(sys.argv), QWebEngineView(), QTimer()
 def look(found):
-    if found and all(found):
-        print(*found, sep="|", flush=True)
+    if found and all(found) and found[0] > 1:
+        print(*found, sep='|', flush=True)
         os._exit(0)  # Qt takes seconds to end
 timer.timeout.connect(lambda: view.page().runJavaScript(f"[{', '.join(NUMBERS)}]", look))
 timer.start(200)
@@ -247,7 +250,7 @@ def test_a_browser_shows_the_page() -> None:
 
     def film() -> None:  # a browser shows a picture of a stream when the next one begins
         while not stopped.wait(0.1):
-            show_live(page, flow, Pace().add(flow), 0.0)
+            show_live(page, flow, "some words", 0.0)
 
     filming = threading.Thread(target=film)
     filming.start()
@@ -259,10 +262,9 @@ def test_a_browser_shows_the_page() -> None:
         filming.join()
         page.close()
     rows, wide, small, words = said.strip().split("|")
-    assert int(rows) == len(flow.markers)
+    assert int(rows) == flow.markers["visible"].sum()
     assert int(wide) > int(small) == 160
-    assert "frame 1: mean motion " in words
-    assert float(words.split()[4]) == pytest.approx(3, abs=0.1)
+    assert words == "some words"
 
 
 def test_a_stream_is_followed_over_the_network() -> None:
