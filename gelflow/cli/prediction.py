@@ -32,12 +32,12 @@ from gelflow.cli.options import (
 from gelflow.errors import InputError, printable
 
 if TYPE_CHECKING:
-    from gelflow.arrays import FlowArray
     from gelflow.baselines import Method
     from gelflow.predict.live import LiveFlow
     from gelflow.predict.page import Page
     from gelflow.predict.prediction import Motion, Prediction
 
+ONLY_MARKERS = "--scene: is for --markers, whose numbers are then in mm; give both"
 SCALE_DECAY = 0.97
 """Share of its scale that a live picture keeps at least from one frame to the next."""
 InPlace = Annotated[str | None, Parameter(help=f"In place of the network: {METHODS}.")]
@@ -68,6 +68,7 @@ def predict(
     from gelflow.data.pairs import PairDataset
     from gelflow.predict.prediction import predict_pair, predict_pairs, predict_video
     from gelflow.terminal import progress
+    from gelflow.track.places import read_places
 
     if len(inputs) not in (1, 2):
         raise InputError(
@@ -76,7 +77,9 @@ def predict(
     for path in inputs:
         if not path.exists():
             raise InputError(f"{path}: there is no such file or folder")
-    places = _places(scene, markers)
+    if scene is not None and not markers:
+        raise InputError(ONLY_MARKERS)
+    places = None if scene is None else read_places(scene)
     estimator = _estimator(weights, method, registration, size, device)
     paired = len(inputs) == 2 or holds_pairs(inputs[0])
     if paired and (reference, every, markers) != ("first", 1, False):
@@ -132,10 +135,13 @@ def live(
     from gelflow.predict.page import Page
     from gelflow.predict.recording import Recording
     from gelflow.track.markers import marker_rows, marker_table
+    from gelflow.track.places import read_places
 
     if not seconds >= 0:
         raise InputError(f"--seconds {seconds:g}: allowed are 0 and more")
-    places = _places(scene, markers is not None)
+    if scene is not None and markers is None:
+        raise InputError(ONLY_MARKERS)
+    places = None if scene is None else read_places(scene)
     estimator = _estimator(weights, method, registration, size, device)
     page = None if port is None else Page(port)
     if page:
@@ -187,15 +193,6 @@ def show_live(page: Page, flow: LiveFlow, words: str, scale: float) -> float:
     picture = draw_overlay(draw_markers(flow.frame, seen), known, round_up(scale))
     page.show(picture, draw_sigma(flow.found.sigma, unknown_px(*flow.found.sigma.shape)), words, seen)
     return scale
-
-
-def _places(scene: Path | None, markers: bool) -> FlowArray | None:
-    """The places of a file that --scene names; InputError without --markers."""
-    from gelflow.track.places import read_places
-
-    if scene is not None and not markers:
-        raise InputError("--scene: is for --markers, whose numbers are then in mm; give both")
-    return None if scene is None else read_places(scene)
 
 
 def _estimator(

@@ -64,7 +64,7 @@ _Z = 1 + 2 * NEAR**2
 class Refined(NamedTuple):
     """A flow (h, w, 2), px, on every fourth pixel, with sigma in px; whether it is known and lost there, (h, w).
 
-    `torn` is as of `gelflow.fast.start.torn`. Elsewhere flow is uncertain.
+    `torn` is as of `gelflow.fast.start.torn`.
     """
 
     flow: FlowArray

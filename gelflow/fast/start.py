@@ -5,10 +5,9 @@ neighbours where they are far apart. Each start is registered under the widest w
 marks, so that one mark's neighbour does not stand for it, the start with the least residual is taken. DIS medium takes
 longest and is tried only where the others leave more than noise.
 
-Where marks move by half their distance or more, all of them may take dots for the next ones. At the edge of what was
-taken, and where nothing fits, images then differ. If they do on more than `MOST_TORN` of the picture, a network is
-asked, which takes ten times as long, and of both flows the one that tears less of the picture is kept. Mixed by their
-residuals they would be worse: next to its edge, a jump explains the picture as well as the truth.
+Where marks move by half their distance or more, all may take dots for the next ones. At the edge of what was taken,
+images then differ. If they do on more than `MOST_TORN` of the picture, a network is asked, which takes ten times as
+long, and of both flows the one that tears less is kept.
 """
 
 import functools
@@ -34,11 +33,9 @@ MOST_UNEXPLAINED = 1e-3
 """Share of the picture that may be left with more than noise before another start is tried."""
 
 
-TORN, MOST_TORN = 0.3, 0.01
-"""Share of the residual of unrelated images above which a flow tears the picture, and share of the picture that may be
-torn before a network is asked. No flow with a jump tore less than 0.018, two of 113 without one tore more than 0.01."""
-UNRELATED = 0.9
-"""Share of the picture that is torn where one image has nothing to do with the other, so that no network helps."""
+TORN, MOST_TORN, UNRELATED = 0.3, 0.01, 0.9
+"""Share of the residual of unrelated images above which a flow tears the picture; shares of the picture that are torn
+between which a network is asked. Beyond the last, one image has nothing to do with the other."""
 
 
 def fresh_start(

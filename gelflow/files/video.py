@@ -14,7 +14,7 @@ from itertools import count
 from pathlib import Path
 from queue import Empty, Queue
 from threading import Event, Thread
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 
@@ -126,23 +126,17 @@ def _rate(capture: Any) -> float:
     return rate if 1.0 <= rate <= 1000.0 else NOMINAL_RATE
 
 
-class NewestFrame(NamedTuple):
-    """A frame's number, its time, s since the source was opened, its pixels, and `time.monotonic` of its arrival."""
-
-    number: int
-    time_s: float
-    frame: Bytes3
-    arrived: float
+Newest = tuple[int, float, Bytes3, float]
+"""A frame's number, its time, s since the source was opened, its pixels, and `time.monotonic` of its arrival."""
 
 
-def newest_frames(source: str) -> Generator[NewestFrame, None, None]:
+def newest_frames(source: str) -> Generator[Newest, None, None]:
     """Yields frames of a camera, leaving out those that come while the caller is busy.
 
     The source is a camera's number, the address of a stream, or a video file, which is played as its time stamps say.
-    The time of a camera's frame is that of its arrival. A camera or stream that goes away, or gives nothing for
-    `STALL_S`, is opened again, with a warning, and goes on when it is back; after `GONE_S` the iterator ends, as it
-    does with a video. When it is closed, it waits for a frame that is being read. InputError where the source does not
-    open or is a folder.
+    A camera's frame has the time of its arrival. A camera or stream that goes away, or gives nothing for `STALL_S`, is
+    opened again, with a warning; after `GONE_S` without a frame the iterator ends, as it does with a video. When it is
+    closed, it waits for a frame that is being read. InputError where the source does not open or is a folder.
     """
     if Path(source).is_dir():
         raise InputError(f"{source}: a folder of images is no camera; predict takes it")
@@ -154,7 +148,7 @@ def newest_frames(source: str) -> Generator[NewestFrame, None, None]:
             f"{source}: it does not open; allowed are a camera's number, such as 0, a stream's address and a video file"
         )
     recorded, ends, rate = Path(source).is_file(), capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0, _rate(capture)
-    newest: Queue[NewestFrame | None] = Queue()
+    newest: Queue[Newest | None] = Queue()
     stopped, last = Event(), -math.inf
 
     def captures() -> Iterator[Any]:
@@ -181,7 +175,7 @@ def newest_frames(source: str) -> Generator[NewestFrame, None, None]:
                         return
                     with suppress(Empty):
                         newest.get_nowait()
-                    newest.put(NewestFrame(next(numbers), time_s, _rgb(found[1]), started + time_s))
+                    newest.put((next(numbers), time_s, _rgb(found[1]), started + time_s))
         finally:
             capture.release()
             newest.put(None)

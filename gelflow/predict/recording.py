@@ -40,10 +40,9 @@ class Recording:
 
     def close(self) -> None:
         """Waits for what is still to be written."""
-        self._writer.shutdown()
-        self._table.close()
-        for each in self._pending:
-            each.result()
+        with self._writer, self._table:
+            for each in self._pending:
+                each.result()
 
     def _write(self, found: Estimate, motion: Motion) -> None:
         write_flow(flow_file(self._out, motion.frame), found.flow, found.visible, found.sigma)

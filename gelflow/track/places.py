@@ -30,12 +30,11 @@ def in_millimetres(markers: NDArray[np.void], places: FlowArray) -> NDArray[np.v
     """Markers whose x, y, u, v and sigma are in mm; NaN where no gel is seen."""
 
     def at(x: NDArray[np.float32], y: NDArray[np.float32]) -> FlowArray:
-        border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (np.nan, np.nan)}
-        return cv2.remap(places, x[None] - 0.5, y[None] - 0.5, cv2.INTER_LINEAR, **border)[0]
+        return cv2.remap(places, x - 0.5, y - 0.5, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, (np.nan, np.nan))[:, 0]
 
     found, x, y = markers.copy(), markers["x"], markers["y"]
-    across, down = at(x + 0.5, y) - at(x - 0.5, y), at(x, y + 0.5) - at(x, y - 0.5)
+    slopes = np.stack([at(x + 0.5, y) - at(x - 0.5, y), at(x, y + 0.5) - at(x, y - 0.5)], axis=-1)
     found["x"], found["y"] = at(x, y).T
     found["u"], found["v"] = (at(x + markers["u"], y + markers["v"]) - at(x, y)).T
-    found["sigma"] *= np.sqrt(np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]))
+    found["sigma"] *= np.sqrt(np.abs(np.linalg.det(slopes)))
     return found

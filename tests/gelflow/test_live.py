@@ -115,8 +115,8 @@ def test_a_camera_that_goes_away_and_comes_back_goes_on(monkeypatch) -> None:
     monkeypatch.setattr(Camera, "opened", 0)
     with pytest.warns(UserWarning, match="0: gives no more frames; waiting"):
         frames = list(newest_frames("0"))
-    assert [frame.number for frame in frames] == list(range(6))
-    times = [frame.time_s for frame in frames]
+    assert [frame[0] for frame in frames] == list(range(6))
+    times = [frame[1] for frame in frames]
     assert times == sorted(set(times))
     assert Camera.opened > 3  # looked for again, and given up
 
