@@ -63,7 +63,7 @@ def main(argv: list[str]) -> int:
                 sigma = uncertainty(flow, *images, "cpu")[0] if estimate is None else estimate.sigma
                 error = endpoint_error(flow, truth.flow)
                 counts = np.isfinite(error) & (truth.visible > 0)
-                error, sigma = error[counts].astype(float), sigma[counts].astype(float)
+                error, sigma = error[counts].astype(np.float64), sigma[counts].astype(np.float64)
                 found[name, path.name].append((1e3 * spent, error.mean(), ause(sigma, error)))
                 step = max(1, len(error) // PIXELS)
                 pixels[name].append(np.stack([sigma, error])[:, ::step])

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from gelflow.predict.page import Page
     from gelflow.predict.prediction import Motion, Prediction
 
-ONLY_MARKERS = "--scene: is for --markers, whose numbers are then in mm; give both"
 SCALE_DECAY = 0.97
 """Share of its scale that a live picture keeps at least from one frame to the next."""
 InPlace = Annotated[str | None, Parameter(help=f"In place of the network: {METHODS}.")]
@@ -77,9 +76,7 @@ def predict(
     for path in inputs:
         if not path.exists():
             raise InputError(f"{path}: there is no such file or folder")
-    if scene is not None and not markers:
-        raise InputError(ONLY_MARKERS)
-    places = None if scene is None else read_places(scene)
+    places = read_places(scene, markers)
     estimator = _estimator(weights, method, registration, size, device)
     paired = len(inputs) == 2 or holds_pairs(inputs[0])
     if paired and (reference, every, markers) != ("first", 1, False):
@@ -139,9 +136,7 @@ def live(
 
     if not seconds >= 0:
         raise InputError(f"--seconds {seconds:g}: allowed are 0 and more")
-    if scene is not None and markers is None:
-        raise InputError(ONLY_MARKERS)
-    places = None if scene is None else read_places(scene)
+    places = read_places(scene, markers is not None)
     estimator = _estimator(weights, method, registration, size, device)
     page = None if port is None else Page(port)
     if page:

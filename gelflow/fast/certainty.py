@@ -116,10 +116,7 @@ def refined(flow: FlowArray, first: Prepared, second: Prepared, before: Refined 
     error, moment = between_marks(error, moment, variance, wide)
     square = RADIUS**2 / 2 * (error + (CURVATURE * CELL**2 * moment).square() * curvature_square(best, CELL))
     fitted, sigma = best[0].movedim(0, -1).contiguous().numpy(), square.clamp(max=MAX_SIGMA_PX**2).sqrt()[0, 0].numpy()
-    lost, inner, torn = _cut(fitted, sigma, first, second)
-    trusted = _largest_part(inner)
-    if before is not None:
-        trusted |= inner & before.known & (np.linalg.norm(fitted - before.flow, axis=-1) < NO_JUMP_PX)
+    trusted, lost, torn = _parts(fitted, sigma, first, second, before)
     return Refined(fitted, np.where(trusted, sigma, np.float32(MAX_SIGMA_PX)), trusted, lost, torn)
 
 
@@ -127,22 +124,25 @@ def doubted(flow: FlowArray, sigma: MapArray, image1: ImageArray, image2: ImageA
     """Any method's sigma (H, W), px, raised to `MAX_SIGMA_PX` where its flow (H, W, 2), px, may have jumped."""
     first, second = Prepared(image1), Prepared(image2)
     grid = (first.grey.shape[0] // CELL, first.grey.shape[1] // CELL)
-    on_cells = resized(first.on_levels(np.nan_to_num(flow)), grid)
-    _, inner, _ = _cut(on_cells, resized(sigma, grid) / np.sqrt(first.scale.prod()), first, second)
-    known = first.on_image(_largest_part(inner).astype(np.float32)) > 0.5
-    return np.where(known, sigma, np.float32(MAX_SIGMA_PX))
+    on_cells, scale = resized(first.on_levels(np.nan_to_num(flow)), grid), np.sqrt(first.scale.prod())
+    known, _, _ = _parts(on_cells, resized(sigma, grid) / scale, first, second)
+    return np.where(first.on_image(known.astype(np.float32)) > 0.5, sigma, np.float32(MAX_SIGMA_PX))
 
 
-def _cut(
-    flow: FlowArray, sigma: MapArray, first: Prepared, second: Prepared
+def _parts(
+    flow: FlowArray, sigma: MapArray, first: Prepared, second: Prepared, before: Refined | None = None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], float]:
-    """`Refined.lost`, what lies some cells from where the picture is cut, and `Refined.torn`."""
+    """`Refined.known`, `lost` and `torn`."""
     wide = unexplained(flow, first, second, CONFIG.windows_px[0])
     left, share = (resized(each, sigma.shape) for each in wide)
     lost, differ = (share > UNEXPLAINED) & (left > (CONFIG.noise / 2) ** 2), left > CONFIG.noise**2
     cut = lost | (share > DOUBTFUL) & differ | (sigma > UNKNOWN_PX) | (_strain(flow) > STRAINED)
-    inner = cv2.erode((~cut).astype(np.uint8), np.ones((GAP, GAP), np.uint8)) > 0
-    return lost, inner, float(((share > TORN) & differ).mean())
+    inner = cv2.erode((~cut).astype(np.uint8), np.ones((GAP, GAP), np.uint8))
+    count, parts, boxes, _ = cv2.connectedComponentsWithStats(inner, connectivity=4)
+    known = parts == (1 + boxes[1:, cv2.CC_STAT_AREA].argmax() if count > 1 else -1)
+    if before is not None:
+        known |= (inner > 0) & before.known & (np.linalg.norm(flow - before.flow, axis=-1) < NO_JUMP_PX)
+    return known, lost, float(((share > TORN) & differ).mean())
 
 
 def _strain(flow: FlowArray) -> MapArray:
@@ -151,12 +151,6 @@ def _strain(flow: FlowArray) -> MapArray:
     gradient = np.stack([across, down], axis=-1) + np.eye(2, dtype=np.float32)
     square = np.swapaxes(gradient, -1, -2) @ gradient
     return np.asarray(np.linalg.norm(square - np.eye(2), axis=(-2, -1)) / 2, np.float32)
-
-
-def _largest_part(inner: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The largest connected part of a mask."""
-    count, parts, boxes, _ = cv2.connectedComponentsWithStats(inner.astype(np.uint8), connectivity=4)
-    return parts == (1 + boxes[1:, cv2.CC_STAT_AREA].argmax() if count > 1 else -1)
 
 
 def _tensor(field: NDArray[np.float32]) -> Tensor:

@@ -5,6 +5,7 @@ are read there, at its pixels before and after; that the gel under it has moved 
 """
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,8 +19,12 @@ MILLIMETRES = ("id", "frame", "time_s", "x_mm", "y_mm", "u_mm", "v_mm", "sigma_m
 """Columns in place of `gelflow.track.markers.COLUMNS`."""
 
 
-def read_places(path: Path) -> FlowArray:
-    """X and Y of the gel at rest (H, W, 2), mm, NaN where there is none; InputError for another file."""
+def read_places(path: Path | None, markers: bool) -> FlowArray | None:
+    """X and Y of the gel at rest (H, W, 2), mm, NaN where there is none; InputError for another file, or no markers."""
+    if path is None:
+        return None
+    if not markers:
+        raise InputError("--scene: is for --markers, whose numbers are then in mm; give both")
     planes = read_channels(path)
     if not {"place.X", "place.Y"} <= set(planes):
         raise InputError(f"{path}: has no channels place.X and place.Y; write it by synth preview --places {path.name}")
@@ -29,7 +34,7 @@ def read_places(path: Path) -> FlowArray:
 def in_millimetres(markers: NDArray[np.void], places: FlowArray) -> NDArray[np.void]:
     """Markers whose x, y, u, v and sigma are in mm; NaN where no gel is seen."""
 
-    def at(x: NDArray[np.float32], y: NDArray[np.float32]) -> FlowArray:
+    def at(x: NDArray[Any], y: NDArray[Any]) -> FlowArray:
         return cv2.remap(places, x - 0.5, y - 0.5, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, (np.nan, np.nan))[:, 0]
 
     found, x, y = markers.copy(), markers["x"], markers["y"]
