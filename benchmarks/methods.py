@@ -61,12 +61,11 @@ def main(argv: list[str]) -> int:
                 flow = method.flow(*images) if estimate is None else estimate.flow
                 spent = time.process_time() - started
                 sigma = uncertainty(flow, *images, "cpu")[0] if estimate is None else estimate.sigma
-                error = endpoint_error(flow, truth.flow)
-                counts = np.isfinite(error) & (truth.visible > 0)
-                error, sigma = error[counts].astype(np.float64), sigma[counts].astype(np.float64)
-                found[name, path.name].append((1e3 * spent, error.mean(), ause(sigma, error)))
-                step = max(1, len(error) // PIXELS)
-                pixels[name].append(np.stack([sigma, error])[:, ::step])
+                off = endpoint_error(flow, truth.flow)
+                counts = np.isfinite(off) & (truth.visible > 0)
+                both = np.stack([sigma[counts], off[counts]]).astype(np.float64)
+                found[name, path.name].append((1e3 * spent, both[1].mean(), ause(both[0], both[1])))
+                pixels[name].append(both[:, :: max(1, both.shape[1] // PIXELS)])
         print(f"{path.name} is done", flush=True)
     rows: list[Row] = []
     for name in methods:
