@@ -102,6 +102,9 @@ def preview(
     *,
     scene: SceneName = DEFAULT_SCENE,
     out: Annotated[Path, Parameter(help="PNG file; further cameras stand beside the main one.")] = Path("preview.png"),
+    places: Annotated[
+        Path | None, Parameter(help="EXR file for where each pixel sees the gel at rest, mm; for gelflow's --scene.")
+    ] = None,
     seed: Annotated[int, Parameter(converter=whole(0), help="Seed of everything random.")] = 0,
     assignments: Assignments = None,
     device: Device = "auto",
@@ -113,7 +116,7 @@ def preview(
 
     template = _loaded(scene, assignments)
     variant = job_variant(template, device)
-    found = photograph(template, out, seed, variant)
+    found = photograph(template, out, seed, variant, places)
     if as_json:
         print(json.dumps(found))
         return 0

@@ -83,15 +83,19 @@ def write_flow(path: Path, flow: FlowField, attributes: Mapping[str, str | int])
     `attributes`, whose integers must fit 32 bits, stand in the header beside `CONVENTIONS`. OSError where the storage
     refuses.
     """
-    import OpenEXR
-
     planes = channels_of(flow)
     planes |= {alias: planes[name] for alias, name in ALIASES.items()}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     meanings = {f"channels.{key}": meaning for key, (names, meaning) in OPTIONAL.items() if set(names) <= set(planes)}
-    header |= {**CONVENTIONS, **meanings, **attributes}
+    write_channels(path, planes, {**CONVENTIONS, **meanings, **attributes})
+
+
+def write_channels(path: Path, planes: Mapping[str, FlowArray], attributes: Mapping[str, str | int]) -> None:
+    """Writes planes (H, W) float32 by channel name; otherwise as `write_flow`."""
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}
     try:
-        OpenEXR.File(header, planes).write(str(path))
+        OpenEXR.File(header, dict(planes)).write(str(path))
     except RuntimeError as error:  # How the library reports a failing disk.
         raise OSError(str(error)) from error
 
