@@ -27,18 +27,14 @@ figure = Figure(figsize=(6, 4), layout="constrained")
 force, slip = figure.subplots(2, 1, sharex=True)
 for axis in "xyz":
     force.plot(states["time_s"], states[f"f{axis}_n"], label=f"F{axis}, N")
-slip.plot(states["time_s"], states["slip_ratio"], label="slip ratio")
-slip.plot(
-    states["time_s"], states["contact_area_mm2"] / states["contact_area_mm2"].max(), label="contact area / largest"
-)
+slip.plot(states["time_s"], states["slip_ratio"], label="slip ratio over seconds")
+area = states["contact_area_mm2"]
+slip.plot(states["time_s"], area / area.max(), label="contact area / largest")
 for axes in (force, slip):
     axes.legend()
-slip.set_xlabel("s")
 figure.savefig(given.out / "states.png", dpi=150)
 
 first, *others = map(Image.fromarray, clip.images)
 first.save(given.out / "film.webp", save_all=True, append_images=others, duration=40, loop=0)
-slides = states["frame"][states["gross_slip"] == 1]
-print(
-    f"{len(clip)} frames, at most {states['fz_n'].max():.2f} N; slides as a whole in {len(slides)} of them: {given.out}"
-)
+slides = states["gross_slip"].sum()
+print(f"{len(clip)} frames, at most {states['fz_n'].max():.2f} N; slides as a whole in {slides} of them")
