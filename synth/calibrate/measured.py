@@ -56,7 +56,8 @@ def fit_measured(fit: SensorFit, frames: Frames, balls: Balls, variant: Variant)
         weight = gel.visible(LightGeometry.of(lights)) * np.tile(_linear(press.rest, gamma).T, (len(lights) // 3, 1))
         return weight[..., None] * _basis(gel.points[:, :2] / side.min(), gel.normals)
 
-    tried = [_shaped(light, sensor, *each) for each in product(_HEIGHTS, _SIZES) for light in _leads(fit, variant)]
+    own = _leads(fit, variant)
+    tried = own + [_shaped(light, sensor, *each) for each in product(_HEIGHTS, _SIZES) for light in own]
     for _ in range(_ROUNDS):
         parts = np.concatenate([rows(press, tried) for press in told], axis=1)
         missed = [np.sum(_solve([parts[k : k + 3]], told, gamma)[1].reshape(3, -1) ** 2, axis=1)
