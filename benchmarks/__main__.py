@@ -24,6 +24,7 @@ QUESTIONS = {
     "throughput": "the main job on this machine: pairs a second, and what limits them",
     "round_gel": "the flow's error against run time for a round gel, by mesh",
     "synthetic_set": "makes the synthetic test set of the report on gelflow",
+    "methods": "flow methods' error against their time on one core, and their sigma",
     "sigma": "is the flow's uncertainty calibrated? fits its constants",
     "pictures": "draws the README's pictures of data",
 }

@@ -29,7 +29,7 @@ from synth.flow.view import View
 from synth.mesh import PadMesh
 from synth.optics import Optics
 from synth.scene import Scene
-from synth.scene.sampling import draw, pairs_of
+from synth.scene.sampling import draw, samples_of
 from synth.scene.template import Template, load_scene
 from synth.simulate import Trajectory
 from synth.simulate.batched.gemm import Host
@@ -77,7 +77,7 @@ def drawn_of(template: Template, count: int, seed: int) -> list[Drawn]:
             scene = draw(template, seed, number)
         except InputError:
             continue
-        frames = {frame for pair in pairs_of(template, seed, number, scene.motion.steps) for frame in pair.frames}
+        frames = {frame for pair in samples_of(template, seed, number, scene.motion.steps) for frame in pair.frames}
         found.append(Drawn(number, scene, mesh, frozenset(frames), template.source.parent))
     if not found:
         raise InputError(f"none of {count} draws of {template.label} keeps the schema; ask for more --trajectories")

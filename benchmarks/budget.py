@@ -36,7 +36,7 @@ from synth.optics import Optics
 from synth.optics.camera import Paths
 from synth.planning.prediction import SOLVE_GROWTH
 from synth.scene import Gel, Scene
-from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, pairs_of, sensor_of
+from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, samples_of, sensor_of
 from synth.scene.template import Template, load_scene, shipped_scenes
 from synth.simulate import Trajectory, simulate
 from synth.simulate.footprint import footprint
@@ -156,7 +156,7 @@ def press_draw(case: Row, assignments: list[str], most: int) -> list[Row]:
         return [{"mesh": "none", "chosen": True, "status": "not drawn", "reason": str(error)}]
     folder, gel = template.source.parent, scene.sensor.gel
     zone = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
-    pairs = pairs_of(template, case["seed"], case["draw"], scene.motion.steps)
+    pairs = samples_of(template, case["seed"], case["draw"], scene.motion.steps)
     frames = frozenset(frame for pair in pairs for frame in pair.frames)
     shown, points = sorted(frames - {0}), places(scene)
     rule = MeshRule.of(scene)

@@ -18,7 +18,7 @@ from multiprocessing import get_context
 from benchmarks.rows import Row, arguments, machine, measure, show
 from synth.errors import InputError
 from synth.pipeline.batched_simulation import BATCH, pad_key
-from synth.scene.sampling import draw, pairs_of
+from synth.scene.sampling import draw, samples_of
 from synth.scene.template import SCENES, load_scene
 from synth.simulate import Trajectory
 from synth.simulate.batched import simulate_presses
@@ -37,7 +37,7 @@ def drawn(case: Row, settings: Sequence[str] = ()) -> tuple[Press, frozenset[int
         press = MeshRule.of(scene).press(scene, template.source.parent)
     except InputError as error:
         return str(error)
-    pairs = pairs_of(template, seed, number, scene.motion.steps)
+    pairs = samples_of(template, seed, number, scene.motion.steps)
     return press, frozenset(frame for pair in pairs for frame in pair.frames)
 
 

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from synth.dataset.reader import SampleData, read_dataset
+from synth.dataset.reader import read_dataset
+from synth.dataset.sample_reader import SampleData
 from synth.inspect.panels import flow_colours, image_picture, robust_scale
 
 
@@ -26,7 +27,7 @@ def gallery(folders: list[Path], out: Path) -> None:
     for axis, folder in zip(axes, folders, strict=False):
         name, sample = _first(folder)
         scale = robust_scale(sample.flow.forward)
-        axis.imshow(np.hstack([image_picture(sample.image2), flow_colours(sample.flow.forward, scale)]))
+        axis.imshow(np.hstack([image_picture(sample.images[1]), flow_colours(sample.flow.forward, scale)]))
         axis.set_title(f"{name}: image 2, flow to {scale:.3g} px", fontsize=8, pad=2)
     figure.tight_layout(pad=0.3)
     figure.savefig(out, pil_kwargs={"quality": 88})
@@ -35,7 +36,7 @@ def gallery(folders: list[Path], out: Path) -> None:
 def row(folders: list[Path], out: Path) -> None:
     """The second images, as high as each other."""
     samples = [_first(folder) for folder in folders]
-    images = [image_picture(sample.image2) for _, sample in samples]
+    images = [image_picture(sample.images[1]) for _, sample in samples]
     widths = [image.shape[1] / image.shape[0] for image in images]
     figure = Figure(figsize=(2.4 * sum(widths), 2.6), dpi=100)
     for axis, image, (name, _) in zip(figure.subplots(1, len(images), width_ratios=widths, squeeze=False)[0], images,

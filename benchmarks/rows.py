@@ -115,6 +115,7 @@ LABELS = {
     "processor_s": "processor time, s",
     "mean_px": "mean error, px",
     "error_px": "error, px",
+    "sigma_px": "sigma, px",
     "predicted_px": "predicted error, px",
     "displacement_percent": "displacement error, %",
     "rmse": "error, levels of 255",

@@ -46,7 +46,13 @@ def stress(
 @app.command
 def calibrate(
     *,
-    frames: Annotated[list[Path], Parameter(consume_multiple=True, help="Images of the gel, to be fitted.")],
+    frames: Annotated[
+        list[Path] | None, Parameter(consume_multiple=True, help="Images of the gel, to be fitted.")
+    ] = None,
+    units: Annotated[
+        list[Path] | None,
+        Parameter(consume_multiple=True, help="Instead: calibrated units, for a scene that covers them all."),
+    ] = None,
     scene: SceneName = DEFAULT_SCENE,
     out: Annotated[Path, Parameter(help="Directory for scene.toml, calibration.png and calibration.json.")] = Path(
         "data/calibration"
@@ -58,6 +64,9 @@ def calibrate(
         list[Path] | None,
         Parameter(consume_multiple=True, help="Images of one ball pressed in, which tell the lights."),
     ] = None,
+    judge_ball: Annotated[
+        list[Path] | None, Parameter(consume_multiple=True, help="Further images of it, compared but not fitted.")
+    ] = None,
     radius_mm: Annotated[float | None, Parameter(help="Radius of that ball.")] = None,
     spacing_mm: Annotated[
         float | None, Parameter(help="Distance between columns of dots; default: keep the scene's field of view.")
@@ -68,14 +77,24 @@ def calibrate(
     rest_map: Annotated[
         bool, Parameter(negative="", help="Also write what lights do not explain as rest_map.png, for the scene.")
     ] = False,
+    measured: Annotated[
+        bool,
+        Parameter(negative="", help="With --ball: light measured on its slopes, in place of lights that are fitted."),
+    ] = False,
     assignments: Assignments = None,
     as_json: AsJson = False,
 ) -> int:
     """Fits a scene's lights, dots and camera to images of your own sensor."""
+    if units:
+        from synth.calibrate.units import run_units
+
+        return run_units(units, out)
     from synth.calibrate import run_calibrate
 
-    balls, others, changes = (ball or [], radius_mm), judge or [], assignments or []
-    return run_calibrate(scene, frames, others, out, changes, spacing_mm, steps, as_json, rest_map, balls)
+    balls, others, changes = (ball or [], judge_ball or [], radius_mm), judge or [], assignments or []
+    return run_calibrate(
+        scene, frames or [], others, out, changes, spacing_mm, steps, as_json, rest_map, balls, measured
+    )
 
 
 @app.command

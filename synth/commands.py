@@ -58,7 +58,7 @@ def generate(
     dry_run: Annotated[bool, Parameter(negative=(), help="Only show the plan.")] = False,
     as_json: AsJson = False,
 ) -> int:
-    """Generates image pairs with exact flow."""
+    """Generates image pairs, or clips, with exact flow."""
     from synth.dataset.shard import Shard
     from synth.dataset.store import output_of
     from synth.pipeline import generate as pipeline
@@ -71,12 +71,12 @@ def generate(
     if dry_run:
         return _show_plan(template, variant, n, as_json)
     _say_hint(variant)
-    with progress(f"{template.name}: pairs", n) as advance:
+    with progress(f"{template.name}: {template.sampling.kind}", n) as advance:
         summary = pipeline.generate(template, n, output_of(out), seed, variant, scheduling, advance)
     if as_json:
         print(json.dumps({"directory": str(summary.directory), **summary.record()}))
     else:
-        _show_summary(summary, variant)
+        _show_summary(summary, variant, template.sampling.kind)
     return 1 if summary.given_up else 0
 
 
@@ -102,6 +102,9 @@ def preview(
     *,
     scene: SceneName = DEFAULT_SCENE,
     out: Annotated[Path, Parameter(help="PNG file; further cameras stand beside the main one.")] = Path("preview.png"),
+    places: Annotated[
+        Path | None, Parameter(help="EXR file for where each pixel sees the gel at rest, mm; for gelflow's --scene.")
+    ] = None,
     seed: Annotated[int, Parameter(converter=whole(0), help="Seed of everything random.")] = 0,
     assignments: Assignments = None,
     device: Device = "auto",
@@ -113,7 +116,7 @@ def preview(
 
     template = _loaded(scene, assignments)
     variant = job_variant(template, device)
-    found = photograph(template, out, seed, variant)
+    found = photograph(template, out, seed, variant, places)
     if as_json:
         print(json.dumps(found))
         return 0
@@ -220,7 +223,7 @@ def export(
     path: Dataset,
     /,
     *,
-    format: Annotated[Literal["flo", "kitti", "npz", "webdataset"], Parameter(help="Layout to write.")],
+    format: Annotated[Literal["flo", "kitti", "npz", "webdataset", "hdf5"], Parameter(help="Layout to write.")],
     out: Annotated[Path, Parameter(help="Directory to write to.")],
     camera: Annotated[str, Parameter(help="Name of a further camera; default: the main one.")] = "",
 ) -> int:
@@ -278,8 +281,11 @@ def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> i
     planned = plan(template, variant)
     predicted = predict(planned)
     _warn(template, predicted.warning)
+    kind = template.sampling.kind
+    unit = kind.removesuffix("s")
     if as_json:
-        print(json.dumps({**planned.record(), **vars(predicted), "n": n}))
+        named = {key.replace("per_pair", f"per_{unit}"): value for key, value in vars(predicted).items()}
+        print(json.dumps({**planned.record(), **named, "n": n}))
         return 0
     title = f"{template.name} with {variant.name}"
     table = Table("feature", "runs", Column("because", overflow="fold"), title=title, title_justify="left")
@@ -296,8 +302,8 @@ def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> i
         f"px per mm on the gel, {seen if sensor.gel.is_flat and camera.lens == 'pinhole' else 'at most'}\n"
         f"mesh: {predicted.resolution}, about {predicted.nodes} displacement nodes\n"
         + _error_line(predicted)
-        + f"predicted per pair: {stages}; {predicted.bytes_per_pair / 1e6:.2f} MB\n"
-        f"predicted for {n} pairs: {duration(n * seconds)} on one core, {n * predicted.bytes_per_pair / 1e9:.2f} GB\n"
+        + f"predicted per {unit}: {stages}; {predicted.bytes_per_pair / 1e6:.2f} MB\n"
+        f"predicted for {n} {kind}: {duration(n * seconds)} on one core, {n * predicted.bytes_per_pair / 1e9:.2f} GB\n"
         f"predicted memory: {predicted.memory_bytes / 1e9:.1f} GB for each process that renders\n"
         "times are predicted within a factor of three"
     )
@@ -315,14 +321,14 @@ def _error_line(predicted: Prediction) -> str:
     return f"{line}; target {predicted.target_error_px:g} px\n"
 
 
-def _show_summary(summary: Summary, variant: Variant) -> None:
+def _show_summary(summary: Summary, variant: Variant, kind: str) -> None:
     from synth.dataset.summary import shares
     from synth.progress import duration
 
     stages = ", ".join(f"{name} {share:.0%}" for name, share in shares(summary.stages).items())
-    rate = f", {summary.samples_per_second:.2f} pairs/s" if summary.made else ""
+    rate = f", {summary.samples_per_second:.2f} {kind}/s" if summary.made else ""
     print(
-        f"{summary.made} pairs made ({summary.found} were there) in {duration(summary.seconds)}{rate} "
+        f"{summary.made} {kind} made ({summary.found} were there) in {duration(summary.seconds)}{rate} "
         f"with {variant.name}: {summary.directory}" + (f", shard {summary.shard}" if summary.shard else "")
     )
     if stages:

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from synth.dataset.exr import write_channels
 from synth.dataset.images import Raster, encode_png
 from synth.dataset.storage import refuse_foreign, replace_file
 from synth.errors import InputError
 from synth.mesh import rest_surface
+from synth.optics import Optics
 from synth.render.camera_image import camera_image
 from synth.render.exposure import advice, levels_of
 from synth.render.measured_light import read_measured_light
@@ -26,15 +28,20 @@ MARK = b"tEXtSoftware\0synth preview"
 """Chunk of the PNG by which a later run knows its own picture."""
 MOST_SAMPLES, MOST_RAYS = 16, 5_000_000
 """Most samples of a pixel and of all pixels."""
+PLACES = {"place.X": "mm", "place.Y": "mm", "place.Z": "mm"}
+"""Channels of the places, and their unit."""
 
 
-def preview(template: Template, out: Path, seed: int, variant: Variant) -> dict[str, Any]:
+def preview(template: Template, out: Path, seed: int, variant: Variant, places: Path | None = None) -> dict[str, Any]:
     """Write a picture of a job's first sensor, all cameras side by side; its levels and advice by camera.
 
-    Boxes look as in the first pair of `generate`, to the bit where that takes no more samples. InputError for what
-    cannot be rendered, and for a file of somebody else.
+    `places` is an EXR file for where the main camera's pixels see the gel at rest, mm in the scene's frame. Boxes look
+    as in the first pair of `generate`, to the bit where that takes no more samples. InputError for what cannot be
+    rendered, and for a file of somebody else.
     """
     refuse_foreign(out, MARK)
+    if places is not None:
+        refuse_foreign(places, min(PLACES).encode())
     instance = draw_sensor(template, seed, 0)
     if instance.content is None:
         raise InputError(f"{template.label}: {instance.rejected[-1]}")
@@ -60,6 +67,13 @@ def preview(template: Template, out: Path, seed: int, variant: Variant) -> dict[
         levels = levels_of(images[-1].squeeze(), gel)
         cameras[name or "main"] = {"levels": levels, "advice": advice(levels, radiance, gel, camera, maps[name])}
     replace_file(out, _png(images))
+    if places is not None:
+        from synth.flow.view import View  # traces rays with Warp
+
+        state = View(surface, Optics.of(sensor)).state(surface.material)
+        points = state.hits.interpolate(surface.triangles, surface.material).reshape(*images[0].shape[:2], 3)
+        planes = {name: points[..., axis].astype(np.float32) for axis, name in enumerate(PLACES)}
+        write_channels(places, planes, PLACES)
     return {"picture": str(out), "pixels_per_mm": scale, "cameras": cameras}
 
 

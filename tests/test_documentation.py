@@ -4,14 +4,18 @@ import doctest
 import importlib
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 import gelflow.cli
 import synth
@@ -106,8 +110,18 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_examples_are_short() -> None:
     programs = sorted(EXAMPLES.glob("*.py"))
-    assert len(programs) == 7
-    assert [program.name for program in programs if len(program.read_text().splitlines()) > 40] == []
+    assert len(programs) == 8
+    lines = {program.name: len(program.read_text().splitlines()) for program in programs}
+    assert lines.pop("ros2_node.py") <= 60
+    assert max(lines.values()) <= 40
+
+
+def test_make_clip(tmp_path: Path) -> None:
+    quick = ['numerics={ element = "p1p1", edge_length_mm = 1.0 }', "render.samples_per_pixel=4", "motion.steps=7"]
+    printed = run("make_clip.py", "--out", tmp_path / "clip", "--set", *quick)
+    assert found(rf"8 frames, at most {NUMBER} N; slides as a whole in [1-7] of them", printed)[0] > 0.3
+    assert Image.open(tmp_path / "clip" / "film.webp").n_frames == 8
+    assert (tmp_path / "clip" / "states.png").stat().st_size > 10_000
 
 
 def test_read_exr(dataset: Path) -> None:
@@ -131,6 +145,50 @@ def test_camera_loop(tmp_path: Path) -> None:
     printed = run("camera_loop.py", tmp_path / "a.avi")
     # JPEG's blocks stand still while the picture moves by 3 px.
     assert found(rf"frame 3: mean motion {NUMBER} px", printed)[0] == pytest.approx(3, abs=0.5)
+
+
+def test_ros2_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With modules in place of ROS: two images come in, one as BGR with padded rows; flow and sigma go out."""
+    Image, topics, sent = SimpleNamespace, {}, []
+
+    def create_publisher(kind: type, name: str, _: object) -> SimpleNamespace:
+        return SimpleNamespace(publish=lambda message: sent.append((name, message)))
+
+    def create_subscription(kind: type, name: str, callback: Any, _: object) -> None:
+        topics[name] = callback
+
+    node = SimpleNamespace(create_publisher=create_publisher, create_subscription=create_subscription)
+    modules = {
+        "rclpy": {"init": lambda: None, "create_node": lambda _: node, "spin": lambda _: None},
+        "rclpy.qos": {"QoSProfile": SimpleNamespace, "ReliabilityPolicy": SimpleNamespace(BEST_EFFORT=2)},
+        "sensor_msgs.msg": {"Image": Image},
+        "std_msgs.msg": {"Empty": SimpleNamespace},
+    }
+    for name, content in modules.items():
+        module = ModuleType(name)
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+    runpy.run_path(str(EXAMPLES / "ros2_node.py"))["main"]()
+    noise = np.random.default_rng(0).integers(0, 256, (64, 80, 3), np.uint8)
+    image = cv2.GaussianBlur(noise, (0, 0), 2)
+    moved = np.roll(image, 2, axis=1)[..., ::-1]
+    padded = np.concatenate([moved.reshape(64, 240), np.zeros((64, 16), np.uint8)], axis=1)
+    size = {"height": 64, "width": 80}
+    topics["image_raw"](Image(header=1, encoding="rgb8", step=240, data=image.tobytes(), **size))
+    assert not sent
+    topics["image_raw"](Image(header=2, encoding="bgr8", step=256, data=padded.tobytes(), **size))
+    assert [name for name, _ in sent] == ["flow", "sigma"]
+    heads = [(message.header, message.encoding, message.step) for _, message in sent]
+    assert heads == [(2, "32FC2", 640), (2, "32FC1", 320)]
+    flow = np.frombuffer(sent[0][1].data, np.float32).reshape(64, 80, 2)
+    assert np.median(flow, axis=(0, 1)) == pytest.approx((2, 0), abs=0.1)
+    topics["reset"](None)
+    grey = image[..., 0]
+    for shift in (0, 1):
+        data = np.roll(grey, shift, axis=0).tobytes()
+        topics["image_raw"](Image(header=3, encoding="mono8", step=80, data=data, **size))
+    flow = np.frombuffer(sent[2][1].data, np.float32).reshape(64, 80, 2)
+    assert np.median(flow, axis=(0, 1)) == pytest.approx((0, 1), abs=0.1)
 
 
 def test_dataloader(dataset: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from gelflow.arrays import Estimate, FlowArray, ImageArray, MapArray
 from gelflow.errors import InputError
+from gelflow.fast.certainty import doubted
 from gelflow.fast.method import Fast
 from gelflow.files.exr import FlowField
 from gelflow.models.working_size import sized_sigma, working_sizes
@@ -43,12 +44,13 @@ def as_array(flow: Any) -> FlowArray:
 def uncertainty(flow: FlowArray, image1: ImageArray, image2: ImageArray, device: str) -> tuple[MapArray, MapArray]:
     """Sigma in px and the probability to be seen in image 2, (H, W) float32: `gelflow.models.uncertainty`.
 
-    Of the sizes at which large images are worked on, the one with the least mean of sigma counts.
+    Of the sizes at which large images are worked on, the one with the least mean of sigma counts. Where the flow may
+    have taken dots for the next ones (`gelflow.fast.certainty`), nothing is known.
     """
     given, first, second = (as_tensor(array, device) for array in (flow, image1, image2))
     maps = (sized_sigma(given, first, second, size) for size in working_sizes(*image1.shape[:2]))
     sigma, visible = min(maps, key=lambda each: float(each[0].mean()))
-    return sigma[0, 0].cpu().numpy(), visible[0, 0].cpu().numpy()
+    return doubted(flow, sigma[0, 0].cpu().numpy(), image1, image2), visible[0, 0].cpu().numpy()
 
 
 def estimated(method: Method, image1: ImageArray, image2: ImageArray) -> tuple[Estimate, float]:

@@ -34,6 +34,9 @@ Registration = Annotated[
         "weights state; best: motion."
     ),
 ]
+Places = Annotated[
+    Path | None, Parameter("--scene", help="Markers in mm: EXR file that synth preview --places wrote for the scene.")
+]
 METHODS = (
     "none, lucas-kanade, farneback, dis-ultrafast, dis-fast, dis-medium, tvl1, dis-motion, dis-both, "
     "dis-brightness, al-dic"

@@ -21,6 +21,7 @@ from gelflow.cli.options import (
     Device,
     OnDevice,
     Out,
+    Places,
     Registered,
     Registration,
     ShippedOrFile,
@@ -32,6 +33,8 @@ from gelflow.errors import InputError, printable
 
 if TYPE_CHECKING:
     from gelflow.baselines import Method
+    from gelflow.predict.live import LiveFlow
+    from gelflow.predict.page import Page
     from gelflow.predict.prediction import Motion, Prediction
 
 SCALE_DECAY = 0.97
@@ -54,6 +57,7 @@ def predict(
     markers: Annotated[
         bool, Parameter(negative=(), help="Of a video: write the motion of the first frame's dots to markers.csv.")
     ] = False,
+    scene: Places = None,
     size: Size = None,
     device: OnDevice = "auto",
     as_json: AsJson = False,
@@ -63,6 +67,7 @@ def predict(
     from gelflow.data.pairs import PairDataset
     from gelflow.predict.prediction import predict_pair, predict_pairs, predict_video
     from gelflow.terminal import progress
+    from gelflow.track.places import read_places
 
     if len(inputs) not in (1, 2):
         raise InputError(
@@ -71,6 +76,7 @@ def predict(
     for path in inputs:
         if not path.exists():
             raise InputError(f"{path}: there is no such file or folder")
+    places = read_places(scene, markers)
     estimator = _estimator(weights, method, registration, size, device)
     paired = len(inputs) == 2 or holds_pairs(inputs[0])
     if paired and (reference, every, markers) != ("first", 1, False):
@@ -83,7 +89,7 @@ def predict(
     else:
         with progress("frames, then overlay", not as_json) as advance:
             result = predict_video(
-                estimator, inputs[0], out, reference, every, lambda n, total: advance(n, total, ""), markers
+                estimator, inputs[0], out, reference, every, lambda n, total: advance(n, total, ""), markers, places
             )
     if result.lost:
         words = f"about {result.lost} frames at its end do not decode (truncated or damaged)"
@@ -105,6 +111,10 @@ def live(
     markers: Annotated[
         Path | None, Parameter(help="File to write the motion of the first frame's dots to, as it comes (CSV).")
     ] = None,
+    out: Annotated[
+        Path | None, Parameter(help="Folder to record flow (EXR) and motion.csv to, as predict does.")
+    ] = None,
+    scene: Places = None,
     size: Size = None,
     device: OnDevice = "auto",
     port: Annotated[int | None, Parameter(converter=whole(0), help="Show the flow at http://127.0.0.1:PORT.")] = None,
@@ -115,40 +125,46 @@ def live(
 ) -> int:
     """Prints the motion of a running camera, a line for each frame, until the camera or Ctrl-C ends it.
 
-    Frames that come while one is computed are left out. With --json each line is JSON.
+    Frames that come while one is computed are left out. A camera that goes away is waited for. With --json each line is
+    JSON. Latency and rate are those of the last 300 frames.
     """
-    from gelflow.predict.live import Page, follow
-    from gelflow.predict.pictures import certain, draw_overlay, robust_scale, round_up
-    from gelflow.track.markers import COLUMNS, marker_rows
+    from gelflow.predict.live import Pace, follow
+    from gelflow.predict.page import Page
+    from gelflow.predict.recording import Recording
+    from gelflow.track.markers import marker_rows, marker_table
+    from gelflow.track.places import read_places
 
     if not seconds >= 0:
         raise InputError(f"--seconds {seconds:g}: allowed are 0 and more")
+    places = read_places(scene, markers is not None)
     estimator = _estimator(weights, method, registration, size, device)
     page = None if port is None else Page(port)
     if page:
         print(f"gelflow: {estimator.name} at {page.address}", file=sys.stderr, flush=True)
-    scale, started = 0.0, time.perf_counter()
-    before = started
+    pace, scale, started = Pace(), 0.0, time.perf_counter()
+    marked = markers is not None or (page is not None and reference == "first")
     try:
         with (
-            closing(follow(estimator, source, reference, markers is not None)) as flows,
+            closing(follow(estimator, source, reference, marked, places)) as flows,
             nullcontext() if markers is None else markers.open("w", newline="", encoding="utf-8") as table,
+            nullcontext() if out is None else closing(Recording(out)) as recording,
         ):
             if table:
-                csv.writer(table).writerow(COLUMNS)
-            for frame, found, motion, moved in flows:
-                if table and moved is not None:
-                    csv.writer(table).writerows(marker_rows(motion.frame, motion.time_s, moved))
+                csv.writer(table).writerow(marker_table(places))
+            for flow in flows:
+                pace.add(flow)
+                motion = flow.motion
+                if recording:
+                    recording.add(flow.found, motion)
+                if table and flow.markers is not None:
+                    csv.writer(table).writerows(marker_rows(motion.frame, motion.time_s, flow.markers, places))
                     table.flush()
+                line = {**asdict(motion), "latency_s": flow.latency_s, "left_out": flow.left_out}
+                words = f"frame {motion.frame}: {_words(motion)}; {pace}"
                 if page:
-                    known = certain(found.flow, found.sigma)
-                    scale = max(SCALE_DECAY * scale, robust_scale(known))
-                    page.show(draw_overlay(frame, known, round_up(scale)))
-                now = time.perf_counter()
-                text = f"{_words(motion)}; {1 / (now - before):.1f} frames/s"
-                print(json.dumps(asdict(motion)) if as_json else f"frame {motion.frame}: {text}", flush=True)
-                before = now
-                if now - started >= seconds:
+                    scale = show_live(page, flow, words, scale)
+                print(json.dumps(line) if as_json else words, flush=True)
+                if time.perf_counter() - started >= seconds:
                     break
     except KeyboardInterrupt:
         pass
@@ -157,7 +173,21 @@ def live(
     finally:
         if page:
             page.close()
+    print(f"gelflow: {pace}", file=sys.stderr)
     return 0
+
+
+def show_live(page: Page, flow: LiveFlow, words: str, scale: float) -> float:
+    """Shows a frame; returns the scale of its picture, px, which goes on from that of the frame before."""
+    from gelflow.models.working_size import unknown_px
+    from gelflow.predict.pictures import certain, draw_markers, draw_overlay, draw_sigma, robust_scale, round_up
+
+    known = certain(flow.found.flow, flow.found.sigma)
+    scale = max(SCALE_DECAY * scale, robust_scale(known))
+    seen = [] if flow.markers is None else [marker.item()[:-1] for marker in flow.markers if marker["visible"]]
+    picture = draw_overlay(draw_markers(flow.frame, seen), known, round_up(scale))
+    page.show(picture, draw_sigma(flow.found.sigma, unknown_px(*flow.found.sigma.shape)), words, seen)
+    return scale
 
 
 def _estimator(

@@ -196,6 +196,8 @@ class TrainConfig(_Frozen):
     mixed_self: float = Field(default=10.0, gt=0)
     """Weight of the self-supervised loss, which changes less with a px of error, beside the endpoint loss under
     supervision = "mixed"."""
+    frames_apart: int | None = Field(default=None, ge=1)
+    """Of clips of synth, pairs of frames that many apart; None: each frame with that at rest."""
     image_size: tuple[int, int] | None = None
     """Rows and columns to which images are resized before the network (the paper: 512, 640); None: as they are."""
     crop_size: tuple[int, int] | None = None

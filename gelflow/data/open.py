@@ -18,7 +18,7 @@ FLYING_CHAIRS = "FlyingChairs_train_val.txt"
 """File beside a folder `data` that holds the pairs."""
 
 
-def pair_records(folder: Path) -> list[PairRecord]:
+def pair_records(folder: Path, frames_apart: int | None = None) -> list[PairRecord]:
     """The pairs of a folder, recognised by what lies in it, or of one shard; see `PairDataset`."""
     if not folder.is_dir() and not shard_files(folder):
         if folder.exists():
@@ -29,7 +29,7 @@ def pair_records(folder: Path) -> list[PairRecord]:
     if (folder / PAIR_SET_FILE).is_file():
         return pair_set_records(folder)
     if is_synthetic(folder):
-        return synthetic_records(folder)
+        return synthetic_records(folder, frames_apart)
     if records := _folder_records(_folder_of_images(folder)):
         return records
     if shards := shard_files(folder):
@@ -54,9 +54,9 @@ def holds_pairs(path: Path) -> bool:
     )
 
 
-def open_all(paths: str | Path | Sequence[str | Path]) -> PairDataset:
+def open_all(paths: str | Path | Sequence[str | Path], frames_apart: int | None = None) -> PairDataset:
     """Folders of pairs or shards as one data set, in order; with more than one, names begin with the folder's name."""
-    datasets = [PairDataset(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
+    datasets = [PairDataset(path, None, frames_apart) for path in ([paths] if isinstance(paths, str | Path) else paths)]
     if len(datasets) == 1:
         return datasets[0]
     records: list[PairRecord] = []

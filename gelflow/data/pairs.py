@@ -17,7 +17,7 @@ from torch.utils.data import Dataset
 from gelflow.arrays import ImageArray, MarkerArray
 from gelflow.data.member import FlowMembers, Member
 from gelflow.errors import InputError
-from gelflow.files.exr import FlowField, read_flow
+from gelflow.files.exr import Direction, FlowField, read_flow
 from gelflow.files.image import read_pair
 
 
@@ -32,6 +32,7 @@ class PairRecord:
         markers: CSV file with tracked dots (columns x1, y1, x2, y2 in px), or None.
         scene: Scene and kind of pattern of a synthetic pair, or None.
         origin: Hash of its data set's scene, and its seed; or None.
+        direction: Which of the flows in an EXR file is from image 1 to image 2.
     """
 
     name: str
@@ -41,6 +42,7 @@ class PairRecord:
     markers: Path | None = None
     scene: str | None = None
     origin: str | None = None
+    direction: Direction = "forward"
 
 
 def without_pattern(scene: str | None) -> bool:
@@ -66,16 +68,22 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
         source: A data set of synth, a pair set of `gelflow pairs`, a folder of NAME_1.png and NAME_2.png, or
             WebDataset shards (*.tar): one of them or a folder.
         records: The pairs, where they are known; `source` then only says in messages where they come from.
+        frames_apart: Of clips of synth, take pairs of frames that many apart, whose exact flow is known for neighbours
+            in clips with `outputs.previous`, else from the frame at rest alone. Default: each frame with that at rest.
 
     Raises:
         InputError: There is no such folder, it is none of these, holds no pair, or is damaged.
     """
 
-    def __init__(self, source: str | Path, records: Sequence[PairRecord] | None = None) -> None:
+    def __init__(
+        self, source: str | Path, records: Sequence[PairRecord] | None = None, frames_apart: int | None = None
+    ) -> None:
+        if frames_apart is not None and frames_apart < 1:
+            raise InputError(f"frames_apart = {frames_apart}: at least 1")
         if records is None:
             from gelflow.data.open import pair_records
 
-            records = pair_records(Path(source))
+            records = pair_records(Path(source), frames_apart)
         if not records:
             raise InputError(f"{source}: holds no image pair")
         self.source = str(source)
@@ -117,7 +125,7 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
         flow = self.records[index].flow
         if isinstance(flow, FlowMembers):
             return flow.read()
-        return None if flow is None else read_flow(flow)
+        return None if flow is None else read_flow(flow, self.records[index].direction)
 
     def markers(self, index: int) -> MarkerArray | None:
         """Tracked dots of a pair, None where it has none; exceptions as for `read_markers`."""

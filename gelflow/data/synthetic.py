@@ -3,16 +3,19 @@
     DIR/dataset.json               schema_version, scene, seed, n, conventions ...
     DIR/manifest.jsonl             a line per finished sample; its `index` is the folder's number
     DIR/samples/000000/            image1.png  image2.png  flow.exr  meta.json
+    DIR/clips/000000/              of clips: frames/000000.png ...  flow/000001.exr ... (from frame 0)  meta.json
 
 Only samples that the manifest lists count: a folder that it does not list may be unfinished.
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from gelflow.data.pairs import PairRecord
 from gelflow.errors import InputError
+from gelflow.files.exr import Direction
 from gelflow.untrusted import parsed, read_file
 
 SCHEMA_VERSION = 1
@@ -24,27 +27,55 @@ def is_synthetic(folder: Path) -> bool:
     return (folder / "dataset.json").is_file() or (folder / "manifest.jsonl").is_file()
 
 
-def synthetic_records(folder: Path) -> list[PairRecord]:
-    """The finished samples of a synth data set, by index.
+def synthetic_records(folder: Path, frames_apart: int | None = None) -> list[PairRecord]:
+    """The pairs of a synth data set, by index: its samples, or of clips pairs of frames.
 
-    InputError where dataset.json or the manifest is missing or damaged, comes from a newer format, lists no sample, or
-    lists a file that is not there.
+    Of clips each frame with that at rest, or those that many frames apart; of these the flow is known from rest, and
+    from one frame to the next where the clip has it. InputError where dataset.json or the manifest is missing or
+    damaged, comes from a newer format, lists no sample, or lists a file that is not there, and where nothing was
+    rendered.
     """
     header, manifest = _read_header(folder / "dataset.json"), folder / "manifest.jsonl"
+    outputs, of_clips = _part(header, "outputs"), _part(header, "sampling").get("kind") == "clips"
+    if outputs.get("images") is False:
+        raise InputError(f"{folder}: has no images; it was made with outputs.images = false")
     records = []
-    for index in sorted(_indices(manifest)):
+    for index, frames in sorted(_finished(manifest).items()):
         name = f"{index:06d}"
-        sample = folder / "samples" / name
-        files = sample / "image1.png", sample / "image2.png", sample / "flow.exr"
-        for path in files:
-            if not path.is_file():
-                raise InputError(f"{path}: the file is missing although {manifest} lists sample {index}; make the data "
-                                 "set again, or remove that line")  # fmt: skip
+        sample = folder / ("clips" if of_clips else "samples") / name
         scene = scene_and_pattern(header, sample / "meta.json")
-        records.append(PairRecord(name, *files, scene=scene, origin=origin(header)))
+        if of_clips:
+            found = _clip_pairs(name, sample, frames, frames_apart, outputs.get("previous") is True)
+        else:
+            found = [PairRecord(name, sample / "image1.png", sample / "image2.png", sample / "flow.exr")]
+        for record in found:
+            for path in (record.image1, record.image2, record.flow):
+                if isinstance(path, Path) and not path.is_file():
+                    raise InputError(f"{path}: the file is missing although {manifest} lists sample {index}; make the "
+                                     "data set again, or remove that line")  # fmt: skip
+        records += [replace(record, scene=scene, origin=origin(header)) for record in found]
     if not records:
         raise InputError(f"{manifest}: lists no finished sample; let synth generate finish first")
     return records
+
+
+def _clip_pairs(name: str, clip: Path, frames: int, apart: int | None, has_previous: bool) -> list[PairRecord]:
+    pairs = [(0, k) for k in range(1, frames)] if apart is None else [(k, k + apart) for k in range(frames - apart)]
+    records = []
+    for first, second in pairs:
+        direction: Direction = "previous" if first else "forward"
+        known = first == 0 or (apart == 1 and has_previous)
+        image1, image2 = (clip / "frames" / f"{frame:06d}.png" for frame in (first, second))
+        flow = clip / "flow" / f"{second:06d}.exr" if known else None
+        records.append(PairRecord(f"{name}-{first:06d}-{second:06d}", image1, image2, flow, direction=direction))
+    return records
+
+
+def _part(header: dict[str, Any], name: str) -> dict[str, Any]:
+    """A table of the scene; empty where there is none."""
+    scene = header.get("scene")
+    part = scene.get(name) if isinstance(scene, dict) else None
+    return part if isinstance(part, dict) else {}
 
 
 def origin(description: Any) -> str | None:
@@ -78,20 +109,24 @@ def _read_header(path: Path) -> dict[str, Any]:
     return dict(header)
 
 
-def _indices(path: Path) -> set[int]:
-    """Indices in the manifest. A last line without its line end was cut by an interruption and does not count."""
+def _finished(path: Path) -> dict[int, int]:
+    """Indices in the manifest, and how many frames each sample has.
+
+    A last line without its line end was cut by an interruption and does not count.
+    """
     try:
         text = read_file(path).decode("utf-8")
     except FileNotFoundError as error:
         raise InputError(f"{path}: the file is missing; no sample has been finished") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file ({error})") from error
-    indices = set()
+    found = {}
     for number, line in enumerate(text.split("\n")[:-1], start=1):
         if not line.strip():
             continue
         try:
-            indices.add(int(json.loads(line)["index"]))
-        except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
+            entry = json.loads(line)
+            found[int(entry["index"])] = len(entry.get("frames", (0, 1)))
+        except (KeyError, TypeError, AttributeError, ValueError, OverflowError, RecursionError) as error:
             raise InputError(f"{path}, line {number}: not a sample's entry with an `index`") from error
-    return indices
+    return found

@@ -4,6 +4,11 @@ As `gelflow.models.evidence`, `gelflow.models.wider_window` and `gelflow.models.
 with two differences. What the flow misses is the Gauss-Newton step that is left. Where the flow leaves more than
 `UNEXPLAINED` of what unrelated images would, and more than the camera's noise, it has lost the pattern. Specks in the
 optics are not looked for.
+
+Dots taken for the next ones explain the images, all but at the edge of the place where they were taken. So the picture
+is cut where images differ, where nothing is known, and where the flow strains the gel much, as between two dots of
+which one jumped. Of its parts the largest is right; of the others nothing is known, because they may have jumped. In a
+stream, what was known in the frame before stays known where it has hardly moved since.
 """
 
 from typing import NamedTuple
@@ -15,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 from torch import Tensor
 
-from gelflow.arrays import Estimate, FlowArray, MapArray
+from gelflow.arrays import Estimate, FlowArray, ImageArray, MapArray
 from gelflow.fast.registration import (
     CELL,
     CONFIG,
@@ -28,6 +33,7 @@ from gelflow.fast.registration import (
     slopes,
     unexplained,
 )
+from gelflow.fast.start import TORN
 from gelflow.models.evidence import MAX_VARIANCE, solved
 from gelflow.models.registration import posterior_variance
 from gelflow.models.uncertainty import (
@@ -44,17 +50,28 @@ from gelflow.ops.gaussian import window_sums
 
 UNEXPLAINED = 0.6
 """Share of the residual of unrelated images above which a flow explains nothing; that of propagation."""
+DOUBTFUL, STRAINED = 0.2, 0.3
+"""The same share, and the norm of Green's strain, at which the picture is cut."""
+NO_JUMP_PX = 4.0
+"""Motion from one frame to the next that is no jump."""
+GAP = 3
+"""Cells: narrower gaps in a cut are closed."""
 NEAR = 0.25
 """Weight of the neighbouring cells in the sum z of a window's pull; its square sum over the centre's is `_Z`."""
 _Z = 1 + 2 * NEAR**2
 
 
 class Refined(NamedTuple):
-    """A flow (h, w, 2), px, on every fourth pixel, with sigma in px; whether it is lost there, (h, w)."""
+    """A flow (h, w, 2), px, on every fourth pixel, with sigma in px; whether it is known and lost there, (h, w).
+
+    `torn` is as of `gelflow.fast.start.torn`.
+    """
 
     flow: FlowArray
     sigma: MapArray
+    known: NDArray[np.bool_]
     lost: NDArray[np.bool_]
+    torn: float
 
     def estimate(self, image: Prepared) -> Estimate:
         """The same at each pixel of an image as it was given, in its px, with the probability to stay in it."""
@@ -67,8 +84,11 @@ class Refined(NamedTuple):
         return Estimate(flow, sigma.clip(max=MAX_SIGMA_PX), visible)
 
 
-def refined(flow: FlowArray, first: Prepared, second: Prepared) -> Refined:
-    """At each place the flow of the window that fits it, from one that `register` found, and how certain that is."""
+def refined(flow: FlowArray, first: Prepared, second: Prepared, before: Refined | None = None) -> Refined:
+    """At each place the flow of the window that fits it, from one that `register` found, and how certain that is.
+
+    `before` is that of the frame before `second`.
+    """
     narrow_px, wide_px = CONFIG.windows_px[-1], CONFIG.windows_px[0]
     one = first.levels[1]
     residual, across, down, _ = fields(flow, one, second.levels[1])
@@ -96,9 +116,41 @@ def refined(flow: FlowArray, first: Prepared, second: Prepared) -> Refined:
     error, moment = between_marks(error, moment, variance, wide)
     square = RADIUS**2 / 2 * (error + (CURVATURE * CELL**2 * moment).square() * curvature_square(best, CELL))
     fitted, sigma = best[0].movedim(0, -1).contiguous().numpy(), square.clamp(max=MAX_SIGMA_PX**2).sqrt()[0, 0].numpy()
-    left, share = (resized(each, grid) for each in unexplained(fitted, first, second, wide_px))
-    lost = (share > UNEXPLAINED) & (left > (CONFIG.noise / 2) ** 2)
-    return Refined(fitted, np.where(lost, np.float32(MAX_SIGMA_PX), sigma), lost)
+    trusted, lost, torn = _parts(fitted, sigma, first, second, before)
+    return Refined(fitted, np.where(trusted, sigma, np.float32(MAX_SIGMA_PX)), trusted, lost, torn)
+
+
+def doubted(flow: FlowArray, sigma: MapArray, image1: ImageArray, image2: ImageArray) -> MapArray:
+    """Any method's sigma (H, W), px, raised to `MAX_SIGMA_PX` where its flow (H, W, 2), px, may have jumped."""
+    first, second = Prepared(image1), Prepared(image2)
+    grid = (first.grey.shape[0] // CELL, first.grey.shape[1] // CELL)
+    on_cells, scale = resized(first.on_levels(np.nan_to_num(flow)), grid), np.sqrt(first.scale.prod())
+    known, _, _ = _parts(on_cells, resized(sigma, grid) / scale, first, second)
+    return np.where(first.on_image(known.astype(np.float32)) > 0.5, sigma, np.float32(MAX_SIGMA_PX))
+
+
+def _parts(
+    flow: FlowArray, sigma: MapArray, first: Prepared, second: Prepared, before: Refined | None = None
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], float]:
+    """`Refined.known`, `lost` and `torn`."""
+    wide = unexplained(flow, first, second, CONFIG.windows_px[0])
+    left, share = (resized(each, sigma.shape) for each in wide)
+    lost, differ = (share > UNEXPLAINED) & (left > (CONFIG.noise / 2) ** 2), left > CONFIG.noise**2
+    cut = lost | (share > DOUBTFUL) & differ | (sigma > UNKNOWN_PX) | (_strain(flow) > STRAINED)
+    inner = cv2.erode((~cut).astype(np.uint8), np.ones((GAP, GAP), np.uint8))
+    count, parts, boxes, _ = cv2.connectedComponentsWithStats(inner, connectivity=4)
+    known = parts == (1 + boxes[1:, cv2.CC_STAT_AREA].argmax() if count > 1 else -1)
+    if before is not None:
+        known |= (inner > 0) & before.known & (np.linalg.norm(flow - before.flow, axis=-1) < NO_JUMP_PX)
+    return known, lost, float(((share > TORN) & differ).mean())
+
+
+def _strain(flow: FlowArray) -> MapArray:
+    """The norm of Green's strain (F^T F - 1) / 2 of a flow on cells, F = 1 + grad V; (h, w)."""
+    down, across = np.gradient(flow, CELL, axis=(0, 1))
+    gradient = np.stack([across, down], axis=-1) + np.eye(2, dtype=np.float32)
+    square = np.swapaxes(gradient, -1, -2) @ gradient
+    return np.asarray(np.linalg.norm(square - np.eye(2), axis=(-2, -1)) / 2, np.float32)
 
 
 def _tensor(field: NDArray[np.float32]) -> Tensor:

@@ -1,8 +1,8 @@
-"""The weights "fast", which are none: DIS, then fast registration, then sigma, on one core of the processor.
+"""The weights "fast": DIS, or the shipped network where DIS fails, then fast registration, then sigma, on a processor.
 
-Nothing is learned. Against exact flow its error is mostly a quarter to a half of that of the best DIS preset, and 1.4
-to 3 times that of the network. Of two images alone, between which marks move by half their distance or more, the
-network loses far fewer.
+Nothing is learned for it. Against exact flow its error is mostly a quarter to a half of that of the best DIS preset,
+and 1.4 to 3 times that of the network. Where marks move by half their distance or more, DIS loses them, and the network
+is asked for a start (`gelflow.fast.start`); it is loaded then.
 """
 
 from pathlib import Path

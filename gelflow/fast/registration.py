@@ -61,7 +61,7 @@ class Level:
 
 
 class Prepared:
-    """What registration and its starts need of an image (H, W, 3) in [0, 1]: its levels by px, and its luma.
+    """What registration and its starts need of an image (H, W, 3) in [0, 1]: itself, its levels by px, and its luma.
 
     Images of more than `gelflow.models.working_size.LARGE` px are reduced, and all are continued beyond the right and
     lower border to multiples of `CELL`. From here on px are those of the reduced image.
@@ -72,6 +72,7 @@ class Prepared:
         self.size = working_sizes(*self.shape)[-1]
         beyond = (0, -self.size[0] % CELL, 0, -self.size[1] % CELL)
         whole = cv2.copyMakeBorder(resized(image, self.size), *beyond, cv2.BORDER_REPLICATE)
+        self.whole: ImageArray = whole
         self.grey: Grey8 = to_grey(whole)
         high = whole - cv2.GaussianBlur(whole, (0, 0), CONFIG.background_px or 0.0)
         half = resized(high, (high.shape[0] // 2, high.shape[1] // 2))

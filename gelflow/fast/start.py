@@ -4,17 +4,27 @@ Small patches lose coarse patterns, large ones detail, and DIS medium, whose flo
 neighbours where they are far apart. Each start is registered under the widest window. In a window that spans several
 marks, so that one mark's neighbour does not stand for it, the start with the least residual is taken. DIS medium takes
 longest and is tried only where the others leave more than noise.
+
+Where marks move by half their distance or more, all may take dots for the next ones. At the edge of what was taken,
+images then differ. If they do on more than `MOST_TORN` of the picture, a network is asked, which takes ten times as
+long, and of both flows the one that tears less is kept.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import cv2
 import numpy as np
+import torch
 
-from gelflow.arrays import FlowArray, Grey8
+from gelflow.arrays import FlowArray, Grey8, ImageArray
 from gelflow.fast.registration import CONFIG, STAGES, Prepared, register, resized, unexplained
+from gelflow.models.estimate import estimate_flow
+from gelflow.models.weights import load_weights, weights_file
 
+Network = Callable[[ImageArray, ImageArray], FlowArray]
+"""Gives the flow between two images of one size; `gelflow.baselines.method.Method.flow`."""
 CHOICE_WINDOW_PX = 25.0
 """Standard deviation of the window in which starts are compared."""
 MIN_GAIN = 0.95
@@ -23,8 +33,18 @@ MOST_UNEXPLAINED = 1e-3
 """Share of the picture that may be left with more than noise before another start is tried."""
 
 
-def fresh_start(first: Prepared, second: Prepared, starts: Sequence[FlowArray] = ()) -> FlowArray:
-    """The flow to go on from after the first stage; `starts` are compared with DIS, and preferred to it."""
+TORN, MOST_TORN, UNRELATED = 0.3, 0.01, 0.9
+"""Share of the residual of unrelated images above which a flow tears the picture; shares of the picture that are torn
+between which a network is asked. Beyond the last, one image has nothing to do with the other."""
+
+
+def fresh_start(
+    first: Prepared, second: Prepared, starts: Sequence[FlowArray] = (), network: Network | None = None
+) -> FlowArray:
+    """The flow to go on from after the first stage; `starts` are compared with DIS, and preferred to it.
+
+    The network is that of the shipped weights, unless another one is given.
+    """
     widest = STAGES[:1]
     first_starts = [*starts, dis("large", first.grey, second.grey), dis("ultrafast", first.grey, second.grey)]
     flow = best_of([register(start, first, second, widest) for start in first_starts], first, second)
@@ -32,6 +52,28 @@ def fresh_start(first: Prepared, second: Prepared, starts: Sequence[FlowArray] =
     if (square > (2 * CONFIG.noise) ** 2).mean() > MOST_UNEXPLAINED:
         medium = register(dis("medium", first.grey, second.grey), first, second, widest)
         flow = best_of([flow, medium], first, second)
+    left = torn(flow, first, second)
+    if MOST_TORN < left < UNRELATED:
+        asked = register((network or _shipped())(first.whole, second.whole), first, second, widest)
+        flow = asked if torn(asked, first, second) < left else flow
+    return flow
+
+
+def torn(flow: FlowArray, first: Prepared, second: Prepared) -> float:
+    """Share of the picture in which a flow leaves more than noise and `TORN`."""
+    square, share = unexplained(flow, first, second, CONFIG.windows_px[0])
+    return float(((share > TORN) & (square > CONFIG.noise**2)).mean())
+
+
+@functools.cache
+def _shipped() -> Network:
+    model = load_weights(weights_file(None))
+    model.config = model.config.model_copy(update={"registration": None})
+
+    def flow(image1: ImageArray, image2: ImageArray) -> FlowArray:
+        one, other = (torch.from_numpy(image).movedim(-1, 0).contiguous()[None] for image in (image1, image2))
+        return np.ascontiguousarray(estimate_flow(model, one, other)[0].movedim(0, -1).numpy())
+
     return flow
 
 

@@ -2,6 +2,7 @@
 
     forward.U forward.V forward.visible     I1(x) = I2(x + forward(x))
     backward.U backward.V backward.visible  the same with the images exchanged
+    previous.U previous.V previous.visible  of a clip's frame: from the frame before, as forward, at its pixels
     forward.sigma                           of an estimate: radius in px within which 68 % of such flows are right
 
 float32, ZIP-compressed; U right, V down, px of the image; a flow belongs to its pixel's centre, (c + 0.5, r + 0.5).
@@ -28,7 +29,7 @@ from gelflow.untrusted import MOST_VALUES
 
 DIRECTIONS = "U right, V down; I1(x) = I2(x + forward(x))"
 """Text in the header of every flow that gelflow writes, by which its files are known."""
-Direction = Literal["forward", "backward"]
+Direction = Literal["forward", "backward", "previous"]
 
 
 class FlowField(NamedTuple):

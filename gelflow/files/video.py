@@ -3,8 +3,10 @@
 Frames are (H, W, 3), RGB, as the decoder gives them: uint8, of images uint16, too.
 """
 
+import math
 import re
 import time
+import warnings
 from collections.abc import Generator, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -28,7 +30,9 @@ SUFFIXES = frozenset(
 COUNTED_SUFFIXES = frozenset({".avi", ".mp4", ".m4v", ".mov"})
 """Files whose headers count frames; others estimate their number from duration and rate."""
 STALL_S = 10
-"""A stream that gives no frame for so long has ended."""
+"""A stream that gives no frame for so long is gone."""
+GONE_S, RETRY_S = 30, 0.5
+"""For so long a camera that is gone is waited for, and looked for so often."""
 NOMINAL_RATE = 25.0
 """Frames per second of what has no rate of its own."""
 
@@ -122,43 +126,56 @@ def _rate(capture: Any) -> float:
     return rate if 1.0 <= rate <= 1000.0 else NOMINAL_RATE
 
 
-def newest_frames(source: str) -> Generator[tuple[int, float, Bytes3], None, None]:
-    """Yields (index, time, frame) of a camera, leaving out the frames that come while the caller is busy.
+Newest = tuple[int, float, Bytes3, float]
+"""A frame's number, its time, s since the source was opened, its pixels, and `time.monotonic` of its arrival."""
+
+
+def newest_frames(source: str) -> Generator[Newest, None, None]:
+    """Yields frames of a camera, leaving out those that come while the caller is busy.
 
     The source is a camera's number, the address of a stream, or a video file, which is played as its time stamps say.
-    The time of a camera's frame is that of its arrival, s since the camera was opened. The iterator ends with the
-    source, and where a stream gives nothing for `STALL_S`. When it is closed, it waits for a frame that is being read.
-    InputError where the source does not open or is a folder.
+    A camera's frame has the time of its arrival. A camera or stream that goes away, or gives nothing for `STALL_S`, is
+    opened again, with a warning; after `GONE_S` without a frame the iterator ends, as it does with a video. When it is
+    closed, it waits for a frame that is being read. InputError where the source does not open or is a folder.
     """
     if Path(source).is_dir():
         raise InputError(f"{source}: a folder of images is no camera; predict takes it")
     if Path(source).is_fifo():
         raise InputError(f"{source}: is a pipe, which may never open; give a camera, a stream's address or a video")
-    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 1000 * STALL_S, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 1000 * STALL_S]
-    with quiet():
-        camera = int(source) if re.fullmatch(r"\d{1,4}", source) else source
-        capture = cv2.VideoCapture(camera, cv2.CAP_ANY, limits if "://" in source else [])
+    capture = _camera(source)
     if not capture.isOpened():
         raise InputError(
             f"{source}: it does not open; allowed are a camera's number, such as 0, a stream's address and a video file"
         )
-    recorded, rate = Path(source).is_file(), _rate(capture)
-    newest: Queue[tuple[int, float, Bytes3] | None] = Queue()
-    stopped = Event()
+    recorded, ends, rate = Path(source).is_file(), capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0, _rate(capture)
+    newest: Queue[Newest | None] = Queue()
+    stopped, last = Event(), -math.inf
+
+    def captures() -> Iterator[Any]:
+        """The source, and the source again as long as it comes back."""
+        nonlocal capture
+        yield capture
+        while not ends and time.monotonic() < last + GONE_S:
+            warnings.warn(f"{source}: gives no more frames; waiting {GONE_S} s for it to come back", stacklevel=1)
+            capture.release()
+            if stopped.wait(RETRY_S):
+                return
+            capture = _camera(source)
+            yield capture
 
     def read() -> None:
-        started, time_s = time.monotonic(), -1 / rate
+        nonlocal last
+        started, time_s, numbers = time.monotonic(), -1 / rate, count()
         try:
-            for index in count():
-                decoded, frame = capture.read()
-                if not decoded:
-                    return
-                time_s = _stamp(capture, time_s, rate) if recorded else time.monotonic() - started
-                if stopped.wait(max(0.0, started + time_s - time.monotonic())):
-                    return
-                with suppress(Empty):
-                    newest.get_nowait()
-                newest.put((index, time_s, _rgb(frame)))
+            for each in captures():
+                while (found := each.read())[0]:
+                    last = time.monotonic()
+                    time_s = _stamp(each, time_s, rate) if recorded else last - started
+                    if stopped.wait(max(0.0, started + time_s - time.monotonic())):
+                        return
+                    with suppress(Empty):
+                        newest.get_nowait()
+                    newest.put((next(numbers), time_s, _rgb(found[1]), started + time_s))
         finally:
             capture.release()
             newest.put(None)
@@ -171,6 +188,14 @@ def newest_frames(source: str) -> Generator[tuple[int, float, Bytes3], None, Non
     finally:
         stopped.set()
         reader.join(STALL_S + 1)  # Python aborts where it ends while a library's call is about to return
+
+
+def _camera(source: str) -> Any:
+    """A cv2.VideoCapture of a camera's number, a stream's address or a file."""
+    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 1000 * STALL_S, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 1000 * STALL_S]
+    with quiet():
+        camera = int(source) if re.fullmatch(r"\d{1,4}", source) else source
+        return cv2.VideoCapture(camera, cv2.CAP_ANY, limits if "://" in source else [])
 
 
 def _rgb(frame: Any) -> Bytes3:

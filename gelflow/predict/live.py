@@ -1,108 +1,89 @@
-"""Flow of a running camera, and a page that shows it."""
+"""Flow of a running camera, and how late it is."""
 
-from collections.abc import Generator
-from contextlib import closing, suppress
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Condition, Thread
+import time
+from collections import deque
+from collections.abc import Generator, Iterator
+from contextlib import closing
 from typing import Any, NamedTuple
 
-import cv2
+import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.arrays import Bytes3, Estimate
+from gelflow.arrays import Bytes3, Estimate, FlowArray
 from gelflow.baselines.method import Method
 from gelflow.errors import InputError
 from gelflow.files.image import full_range, in_unit_range, to_bytes
 from gelflow.files.video import newest_frames
 from gelflow.predict.prediction import Motion, motion_of
-from gelflow.predict.stream import Reference, Stream
+from gelflow.predict.stream import Indexed, Reference, followed
+
+LAST = 300
+"""Frames over which latency and rate are measured."""
 
 
 class LiveFlow(NamedTuple):
-    """The newest frame, the flow that leads to it, its motion, and the markers, if they were asked for."""
+    """The newest frame, the flow that leads to it, its motion, and the markers, if they were asked for.
+
+    `latency_s` is the time from the frame's arrival to the flow, `left_out` the number of frames before this one that
+    came while the last one was computed.
+    """
 
     frame: Bytes3
     found: Estimate
     motion: Motion
     markers: NDArray[Any] | None
+    latency_s: float
+    left_out: int
 
 
 def follow(
-    method: Method, source: str, reference: Reference = "first", markers: bool = False
+    method: Method,
+    source: str,
+    reference: Reference = "first",
+    markers: bool = False,
+    places: FlowArray | None = None,
 ) -> Generator[LiveFlow, None, None]:
     """Yields the flow to each newest frame, from the first frame or from the one that was used before.
 
-    The source is as `newest_frames` takes it. InputError where it does not open or gives fewer than two frames, its
-    frames change their size, or the method cannot use them.
+    The source is as `newest_frames` takes it, the rest as for `followed`. InputError where it does not open or gives
+    fewer than two frames, its frames change their size, or the method cannot use them.
     """
-    stream: Stream | None = None
-    used = 0
+    arrivals: deque[tuple[int, float]] = deque(maxlen=2)
     with closing(newest_frames(source)) as newest:
-        for index, time_s, frame in newest:
-            used += 1
-            try:
-                if stream is None:
-                    stream = Stream(method, frame, reference, markers)
-                    continue
-                found, seconds, moved = stream.update(frame)
-            except InputError as error:
-                raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
+
+        def noted() -> Iterator[Indexed]:
+            for index, time_s, frame, arrived in newest:
+                arrivals.append((index, arrived))
+                yield index, time_s, frame
+
+        for (index, time_s, frame), (found, seconds, moved) in followed(
+            method, noted(), lambda _: source, reference, markers, places
+        ):
+            latency_s = time.monotonic() - arrivals[-1][1]
+            left_out = index - arrivals[0][0] - 1
             image = in_unit_range(frame)
             motion = motion_of(found, index, source, time_s, seconds)
-            yield LiveFlow(to_bytes(full_range(image, image)[0]), found, motion, moved)
-    if used < 2:
+            yield LiveFlow(to_bytes(full_range(image, image)[0]), found, motion, moved, latency_s, left_out)
+    if len(arrivals) < 2:
         raise InputError(f"{source}: fewer than two frames came; does another program use the camera?")
 
 
-class Page:
-    """Serves the newest picture to browsers of this machine, as a stream of JPEG images."""
+class Pace:
+    """Latency and rate as they were measured over the last `LAST` frames, and the frames left out so far."""
 
-    def __init__(self, port: int) -> None:
-        """InputError where the port, 0 for any free one, is taken or no port."""
-        self._jpeg, self._number, self._changed = b"", 0, Condition()
-        page = self
+    def __init__(self) -> None:
+        self._latencies: deque[tuple[float, float]] = deque(maxlen=LAST)
+        self.left_out = 0
 
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                if self.headers.get("Host", "").partition(":")[0] not in ("127.0.0.1", "localhost"):
-                    self.send_error(403, "Ask for 127.0.0.1 or localhost")  # another name may be a stranger's page
-                    return
-                self.send_response(200)
-                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=picture")
-                self.end_headers()
-                seen = 0
-                with suppress(ConnectionError):
-                    while True:
-                        seen, jpeg = page._newer_than(seen)
-                        head = f"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-                        self.wfile.write(head.encode() + jpeg + b"\r\n")
+    def add(self, flow: LiveFlow) -> None:
+        self._latencies.append((flow.latency_s, time.monotonic()))
+        self.left_out += flow.left_out
 
-            def log_message(self, *_: object) -> None:
-                """Nothing is logged."""
-
-        try:
-            self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
-        except (OSError, OverflowError) as error:
-            raise InputError(f"port {port}: {error}") from None
-        Thread(target=self._server.serve_forever, daemon=True).start()
-
-    @property
-    def address(self) -> str:
-        return f"http://127.0.0.1:{self._server.server_port}"
-
-    def show(self, picture: Bytes3) -> None:
-        """Replaces the picture, RGB."""
-        jpeg = cv2.imencode(".jpg", picture[..., ::-1])[1].tobytes()
-        with self._changed:
-            self._jpeg, self._number = jpeg, self._number + 1
-            self._changed.notify_all()
-
-    def _newer_than(self, seen: int) -> tuple[int, bytes]:
-        """The number of the newest picture, and the picture; waits for one after those that were seen."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._number > seen)
-            return self._number, self._jpeg
-
-    def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
+    def __str__(self) -> str:
+        if not self._latencies:
+            return "no flow"
+        latencies, times = zip(*self._latencies, strict=True)
+        median, most = 1e3 * np.percentile(latencies, (50, 95))
+        rate = (len(times) - 1) / max(times[-1] - times[0], 1e-9)
+        words = f"latency {median:.0f} ms in the median, {most:.0f} ms at 95 %"
+        return f"{words}; {rate:.1f} frames/s, {self.left_out} left out"

@@ -109,8 +109,8 @@ def load_model(
 
     Args:
         name_or_path: "best", the weights that come with the package; a file that `gelflow train` or `finetune` wrote
-            (weights.safetensors); or "fast", DIS with fast registration on one core, which has no weights and takes a
-            thirtieth of the time (see `gelflow.fast.method`).
+            (weights.safetensors); or "fast", DIS with fast registration on the processor, which takes a thirtieth of
+            the time, or a third where it asks the network of "best" for a start (see `gelflow.fast.method`).
         device: "cpu", "cuda", or "auto", a CUDA device where there is one.
         registration: "none", "motion", "both" or "brightness": how the flow is corrected on the images; None: what the
             weights ask for, which is "motion" for "best".

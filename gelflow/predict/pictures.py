@@ -6,6 +6,7 @@ and follows the flow, so that a flow of some hundredths of a px fills the wheel 
 """
 
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -111,6 +112,22 @@ def draw_overlay(frame: Bytes3, flow: FlowArray, scale_px: float) -> Bytes3:
     _label(right, f"rim: {scale_px:g} px", (8, side + 30))
     picture = np.concatenate([left, right], axis=1)
     return np.ascontiguousarray(picture[: picture.shape[0] // 2 * 2])
+
+
+def draw_sigma(sigma: MapArray, unknown: float) -> Bytes3:
+    """Sigma as a picture (H, W, 3): dark at 0, bright below, and grey from `unknown` px on."""
+    share = (sigma / unknown).clip(0, 1)
+    picture = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1].copy()
+    picture[share >= 1] = UNKNOWN_COLOUR
+    return picture
+
+
+def draw_markers(frame: Bytes3, markers: Iterable[tuple[float, ...]]) -> Bytes3:
+    """A frame with a circle at each marker (id, x, y, u, v, ...), px."""
+    drawn = frame.copy()
+    for _, x, y, u, v, *_ in markers:
+        cv2.circle(drawn, (round(x + u - 0.5), round(y + v - 0.5)), 3, (0, 255, 0), 1)
+    return drawn
 
 
 def arrow_factor(scale_px: float) -> float:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.arrays import Bytes3, Estimate, Frame
+from gelflow.arrays import Bytes3, Estimate, FlowArray, Frame
 from gelflow.baselines.method import Method, estimated
 from gelflow.data.pairs import PairDataset, PairRecord
 from gelflow.errors import InputError
@@ -24,14 +24,14 @@ from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
 from gelflow.models.working_size import unknown_px
 from gelflow.predict.pictures import certain, draw_overlay, robust_scale, write_flow_picture
-from gelflow.predict.stream import Reference, Stream
-from gelflow.track.markers import COLUMNS, marker_rows
+from gelflow.predict.stream import Indexed, Reference, followed
+from gelflow.track.markers import marker_rows, marker_table
 
 MAX_RATE = 600.0
 """Largest number of frames per second of an overlay."""
 MOTIONS, MOTIONS_BEGIN = "motion.csv", b"mean_px,p95_px"
 """The table of motions, and what tells it from other tables."""
-MARKERS, MARKERS_BEGIN = "markers.csv", ",".join(COLUMNS).encode()
+MARKERS, MARKERS_BEGIN = "markers.csv", b"id,frame,time_s,x"
 """The table of markers, likewise."""
 
 
@@ -52,6 +52,9 @@ class Motion:
     p99_px: float
     compute_s: float
     unknown: float
+
+
+MOTION_COLUMNS = [column.name for column in fields(Motion)]
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,7 @@ def _predicted(method: Method, dataset: PairDataset, index: int, out: Path) -> t
 
 
 def _write_motions(out: Path, motions: list[Motion]) -> Path:
-    write_csv(out / MOTIONS, [column.name for column in fields(Motion)], map(astuple, motions))
+    write_csv(out / MOTIONS, MOTION_COLUMNS, map(astuple, motions))
     return out / MOTIONS
 
 
@@ -121,11 +124,13 @@ def predict_video(
     every: int = 1,
     progress: Callable[[int, int], None] | None = None,
     markers: bool = False,
+    places: FlowArray | None = None,
 ) -> Prediction:
     """Writes flow/000001.exr ... (numbered by frame), motion.csv and overlay.mp4 in place of an earlier run's.
 
     Every `every`-th frame of a video file or a folder of images is taken; the flow leads to it from the first one or
-    from its predecessor. With `markers`, markers.csv holds those of the first frame in each other. `progress` is called
+    from its predecessor. With `markers`, markers.csv holds those of the first frame in each other, in mm where `places`
+    (`gelflow.track.places`) are given. `progress` is called
     with the number of frames done and to be done; each counts twice, for flow and overlay. InputError where the video
     does not open, fewer than two frames decode, a frame cannot be used, or files of these names are somebody else's;
     OSError where a file cannot be written.
@@ -142,31 +147,31 @@ def predict_video(
     video = out / "overlay.mp4"
     refuse_foreign(out / MOTIONS, MOTIONS_BEGIN, video)
     refuse_foreign(out / MARKERS, MARKERS_BEGIN)
-    for earlier in _earlier_flows(out):
+    for earlier in earlier_flows(out):
         refuse_foreign(earlier, DIRECTIONS.encode())
     sources = dict(enumerate(image_files(path))) if path.is_dir() else {}
     files: list[Path] = []
     motions: list[Motion] = []
     times: list[float] = []
     marked: list[tuple[int, float | None, NDArray[Any]]] = []
-    scale, stream = 0.0, None
-    for index, time_s, frame in _frames(path, every):
-        times.append(index / info.frames_per_second if time_s is None else time_s)
-        source = sources.get(index, path)
-        try:
-            if stream is None:
-                stream = Stream(method, frame, reference, markers)
-                continue
-            found, seconds, moved = stream.update(frame)
-        except InputError as error:
-            raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
-        motion = motion_of(found, index, source.name, time_s, seconds)
+    scale = 0.0
+
+    def timed() -> Iterator[Indexed]:
+        for index, time_s, frame in _frames(path, every):
+            times.append(index / info.frames_per_second if time_s is None else time_s)
+            yield index, time_s, frame
+
+    def named(index: int) -> Path:
+        return sources.get(index, path)
+
+    for (index, time_s, _), (found, seconds, moved) in followed(method, timed(), named, reference, markers, places):
+        motion = motion_of(found, index, named(index).name, time_s, seconds)
         if moved is not None:
             marked.append((index, time_s, moved))
         if not files:
-            for earlier in _earlier_flows(out):
+            for earlier in earlier_flows(out):
                 earlier.unlink()
-        files.append(out / "flow" / f"{index:06d}.exr")
+        files.append(flow_file(out, index))
         write_flow(files[-1], found.flow, found.visible, found.sigma)
         motions.append(motion)
         scale = max(scale, robust_scale(certain(found.flow, found.sigma)))
@@ -174,8 +179,8 @@ def predict_video(
             progress(len(motions), 2 * expected)
     tables = [_write_motions(out, motions)]
     if markers:
-        rows = (row for index, time_s, moved in marked for row in marker_rows(index, time_s, moved))
-        write_csv(out / MARKERS, COLUMNS, rows)
+        rows = (row for index, time_s, moved in marked for row in marker_rows(index, time_s, moved, places))
+        write_csv(out / MARKERS, marker_table(places), rows)
         tables.append(out / MARKERS)
     elif (out / MARKERS).exists():
         (out / MARKERS).unlink()
@@ -184,7 +189,7 @@ def predict_video(
         for count, (index, _, frame) in enumerate(_frames(path, every), len(motions)):
             flow = np.zeros((*frame.shape[:2], 2), np.float32)
             if index > 0:
-                field = read_flow(out / "flow" / f"{index:06d}.exr")
+                field = read_flow(flow_file(out, index))
                 flow = certain(field.flow, field.sigma)
             image = in_unit_range(frame)
             yield draw_overlay(to_bytes(full_range(image, image)[0]), flow, scale)
@@ -248,6 +253,11 @@ def _write_overlay(pictures: Iterator[Bytes3], video: Path, places: list[int], r
         temporary.unlink(missing_ok=True)
 
 
-def _earlier_flows(out: Path) -> list[Path]:
+def flow_file(out: Path, index: int) -> Path:
+    """The file of the flow to a frame."""
+    return out / "flow" / f"{index:06d}.exr"
+
+
+def earlier_flows(out: Path) -> list[Path]:
     """What an earlier run wrote, which may have had other frames: files named by six digits or more."""
     return [path for path in (out / "flow").glob("*.exr") if re.fullmatch(r"[0-9]{6,}", path.stem)]

@@ -1,10 +1,12 @@
 """Frames of a recording or a camera, one after the other: the flow to each, and the markers that move with it."""
 
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from numpy.typing import NDArray
 
-from gelflow.arrays import Estimate, Frame
+from gelflow.arrays import Estimate, FlowArray, Frame
 from gelflow.baselines.method import Method, estimated
 from gelflow.errors import InputError
 from gelflow.fast.method import Fast
@@ -51,3 +53,36 @@ class Stream:
         if self._reference == "previous":
             self._before = frame
         return Followed(found, seconds, None if self._markers is None else self._markers.at(found, images[1]))
+
+
+Indexed = tuple[int, float | None, Frame]
+"""A frame's number, its time, s, where it has one, and its pixels."""
+
+
+def followed(
+    method: Method,
+    frames: Iterable[Indexed],
+    named: Callable[[int], str | Path],
+    reference: Reference = "first",
+    markers: bool = False,
+    places: FlowArray | None = None,
+) -> Iterator[tuple[Indexed, Followed]]:
+    """Yields each frame but the first with what was found in it.
+
+    InputError where a frame cannot be used or is not of the size of `places`; it says what `named` gives for the
+    frame's number.
+    """
+    stream: Stream | None = None
+    for each in frames:
+        index, _, frame = each
+        try:
+            if places is not None and frame.shape[:2] != places.shape[:2]:
+                size = f"{places.shape[1]}x{places.shape[0]}"
+                raise InputError(f"--scene: it has {size} px, the frame {frame.shape[1]}x{frame.shape[0]}")
+            if stream is None:
+                stream = Stream(method, frame, reference, markers)
+                continue
+            found = stream.update(frame)
+        except InputError as error:
+            raise InputError(f"{named(index)}, frame {index}, {method.name}: {error}") from error
+        yield each, found

@@ -1,21 +1,24 @@
 """Markers: dots, blobs or pins of the reference, moved by the flow. No grid is assumed, and none is fitted.
 
 Each marker is read from the flow at its own centre, so that a missing or broken one disturbs no other. It is visible
-where it stays in the image, sigma is known, and the two images resemble each other in a window of its own size.
+where it stays in the image, sigma is known, the two images resemble each other in a window of its own size, and no
+surer marker is at the same place.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
-from gelflow.arrays import Estimate, ImageArray, MapArray
+from gelflow.arrays import Estimate, FlowArray, ImageArray, MapArray
 from gelflow.fast.registration import indices, resized
 from gelflow.files.image import to_grey
 from gelflow.models.working_size import unknown_px
 from gelflow.ops.blobs import SIZES, blob_centre, blobs, inside_by
+from gelflow.track.places import MILLIMETRES, in_millimetres
 
 MARKERS = np.dtype(
     [("id", np.int32), *((name, np.float32) for name in ("x", "y", "u", "v", "sigma")), ("visible", np.bool_)]
@@ -63,6 +66,9 @@ class Markers:
         likeness = resized(_likeness(self._reference, moved, self._deviation), grey.shape)
         known = markers["sigma"] < unknown_px(*found.sigma.shape)
         markers["visible"] = known & (read(found.visible) > 0.5) & (read(likeness) > MIN_LIKENESS)
+        ends = np.nan_to_num(np.stack([markers["x"] + markers["u"], markers["y"] + markers["v"]], axis=-1))
+        for pair in KDTree(ends).query_pairs(self._deviation):
+            markers["visible"][max(pair, key=lambda one: markers["sigma"][one])] = False
         return markers
 
 
@@ -75,8 +81,15 @@ def _likeness(image1: MapArray, image2: MapArray, deviation: float) -> MapArray:
     return 2 * (mixed - mean1 * mean2) / (square - mean1**2 - mean2**2).clip(1e-9)
 
 
-def marker_rows(frame: int, time_s: float | None, markers: Iterable[Any]) -> Iterator[tuple[Any, ...]]:
-    """The rows of `COLUMNS` for the markers of one frame."""
-    for marker in markers:
+def marker_table(places: FlowArray | None) -> Sequence[str]:
+    """The columns of a table of markers, whose numbers are in mm where places are known."""
+    return COLUMNS if places is None else MILLIMETRES
+
+
+def marker_rows(
+    frame: int, time_s: float | None, markers: NDArray[np.void], places: FlowArray | None = None
+) -> Iterator[tuple[Any, ...]]:
+    """The rows of such a table for the markers of one frame."""
+    for marker in markers if places is None else in_millimetres(markers, places):
         numbers = (round(float(marker[name]), 4) for name in COLUMNS[3:-1])
         yield marker["id"], frame, time_s, *numbers, int(marker["visible"])

@@ -2,15 +2,14 @@
 
 The start of a frame is the last flow, moved on by what DIS sees between the last two frames:
 ``V(x) = U(x) + D(x + U(x))``. Registration between the reference and the frame then corrects it, so that errors do not
-add up, and motion may grow beyond what a direct flow finds. Where the result explains hardly more of the frame than
-chance (`gelflow.fast.certainty`), it is lost, and starts that know nothing of the stream compete with it: DIS from the
-reference, and the network where there is one. After a frame in which most of the picture is lost, such as a cut or one
-of a ramp of exposure, the next one starts afresh. A flow that took dots for the next ones is not noticed.
+add up, and motion may grow beyond what a direct flow finds. Where the result tears more of the picture than before, as
+one does that took dots for the next ones, starts that know nothing of the stream compete with it: DIS from the
+reference, and a network if that tears, too (`gelflow.fast.start`). After a frame in which most of the picture is lost,
+such as a cut or one of a ramp of exposure, the next one starts afresh.
 """
 
 import math
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,8 +22,8 @@ from gelflow.baselines.learned import open_network
 from gelflow.errors import InputError
 from gelflow.fast.certainty import Refined, refined
 from gelflow.fast.method import FAST, Fast
-from gelflow.fast.registration import STAGES, Prepared, Stage, indices, register, resized
-from gelflow.fast.start import dis, fresh_start
+from gelflow.fast.registration import STAGES, Prepared, indices, register, resized
+from gelflow.fast.start import MOST_TORN, dis, fresh_start
 from gelflow.files.image import as_image, check_images, range_factor
 from gelflow.models.uncertainty import MAX_SIGMA_PX
 from gelflow.models.weights import weights_file
@@ -32,8 +31,6 @@ from gelflow.track.markers import Markers
 
 TRACKING = (STAGES[0], STAGES[-1])
 """Stages from the last flow on. The first smooths it, so that errors between marks do not add up over frames."""
-MOST_LOST = 0.01
-"""Share of the picture that may be lost, beyond what the last fresh start left, before fresh starts compete."""
 RETRY = 10
 """Frames after which they compete again for what the last ones left."""
 CUT = 0.5
@@ -62,8 +59,8 @@ class Tracker:
     Args:
         reference: The gel at rest, or whatever motion is counted from: (H, W, 3), (H, W, 4) or (H, W), uint8, uint16 or
             float in [0, 1]; each side has 16 px or more. Larger images than 400 x 300 px are reduced.
-        weights: What takes over where the stream is lost: "fast", DIS alone; "best" or a file of weights, that network,
-            too, for such frames only. A network takes as long as `load_model` does.
+        weights: The network that is asked where DIS, too, loses the stream: "fast", the shipped one without its
+            registration; "best" or a file of weights, that one with what it comes with.
         scene: None alone is allowed; motion and markers are in px.
 
     Raises:
@@ -80,7 +77,7 @@ class Tracker:
         if scene is not None:
             raise InputError(f"scene = {scene!r}: millimetres are not known here; give None, and take px")
         method = open_network(weights_file(Path(weights)))
-        self._network = None if isinstance(method, Fast) else method
+        self._network = None if isinstance(method, Fast) else method.flow
         self.reset(reference)
 
     def reset(self, reference: ImageArray | Bytes3 | None = None) -> None:
@@ -91,7 +88,7 @@ class Tracker:
             self._factor = np.float32(range_factor(float(image.max())))
             self._image = self._factor * image
             self._first, self._markers = Prepared(self._image), Markers(self._image)
-        self._last: tuple[Prepared, FlowArray] | None = None
+        self._last: tuple[Prepared, Refined] | None = None
         self._since, self._accepted = 0, 0.0
         self._time_s = -math.inf
 
@@ -124,23 +121,19 @@ class Tracker:
         second, flows = Prepared(image), list[FlowArray]()
         self._since += 1
         if self._last is not None:
-            flows.append(_moved_on(*self._last, second))
-            found = self._registered(flows[0], second, TRACKING)
-            lost = float(found.lost.mean())
-            self._accepted = min(self._accepted, lost)
-        if self._last is None or lost > (self._accepted if self._since < RETRY else 0.0) + MOST_LOST:
-            if self._network is not None:
-                flows.append(self._first.on_levels(self._network.flow(self._image, image)))
-            found = self._registered(fresh_start(self._first, second, flows), second, STAGES[1:])
-            self._since, self._accepted = 0, float(found.lost.mean())
+            before, last = self._last
+            flows.append(_moved_on(before, last.flow, second))
+            found = refined(register(flows[0], self._first, second, TRACKING), self._first, second, last)
+            self._accepted = min(self._accepted, found.torn)
+        if self._last is None or found.torn > (self._accepted if self._since < RETRY else 0.0) + MOST_TORN:
+            start = fresh_start(self._first, second, flows, self._network)
+            found = refined(register(start, self._first, second, STAGES[1:]), self._first, second)
+            self._since, self._accepted = 0, found.torn
         if found.lost.mean() > CUT:
             self._last = None
             return found._replace(sigma=np.full_like(found.sigma, MAX_SIGMA_PX)), True
-        self._last = (second, found.flow)
+        self._last = (second, found)
         return found, self._since == 0
-
-    def _registered(self, flow: FlowArray, second: Prepared, stages: Sequence[Stage]) -> Refined:
-        return refined(register(flow, self._first, second, stages), self._first, second)
 
 
 def _moved_on(before: Prepared, flow: FlowArray, second: Prepared) -> FlowArray:

@@ -41,5 +41,6 @@ def train(
     initial = None if weights is None else weights_file(Path(weights))
     start = {} if initial is None else {"model": load_weights(initial).config.model_dump()}
     settings = train_config(config, set, start)
-    validation_set = open_all(validation) if validation else None
-    return run.train(settings, open_all(data), validation_set, Path(out), initial=initial, resume=resume)
+    apart = settings.frames_apart
+    validation_set = open_all(validation, apart) if validation else None
+    return run.train(settings, open_all(data, apart), validation_set, Path(out), initial=initial, resume=resume)

@@ -11,9 +11,11 @@ from matplotlib.figure import Figure
 from synth.arrays import BoolArray, FloatArray
 from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import PLACE
+from synth.calibrate.pressed_ball import PressedBall
 from synth.errors import InputError
 from synth.mesh import rest_surface
 from synth.render.camera_image import encoded, expected_signal
+from synth.render.measured_light import LightModel
 from synth.render.pattern import albedo, pixels_per_mm
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant
@@ -58,8 +60,14 @@ class Comparison:
         return float(np.percentile(local[self.outside], 99)), (int(column), int(row))
 
 
-def render_undeformed(sensor: Sensor, render: Render, variant: Variant) -> FloatArray:
-    """The undeformed gel's picture (H, W, 3), encoded, in [0, 1], without noise and quantisation.
+def render_gel(
+    sensor: Sensor,
+    render: Render,
+    variant: Variant,
+    measured: LightModel | None = None,
+    pressed: PressedBall | None = None,
+) -> FloatArray:
+    """The gel's picture (H, W, 3) at rest or pressed, encoded, in [0, 1], without noise and quantisation.
 
     Dots are drawn on their grid without jitter, which no frame tells for another gel.
     """
@@ -67,9 +75,10 @@ def render_undeformed(sensor: Sensor, render: Render, variant: Variant) -> Float
     if isinstance(sensor.pattern, Dots):
         even = sensor.pattern.model_copy(update={"jitter_mm": 0.0, "radius_jitter": 0.0})
         plain = sensor.model_copy(update={"pattern": even})
-    surface = rest_surface(sensor.gel)
-    renderer = Renderer(sensor, render, surface, albedo(plain, np.random.default_rng(0)), variant)
-    return encoded(expected_signal(renderer.radiance(surface.material, 0), sensor.camera), sensor.camera)
+    surface = rest_surface(sensor.gel) if pressed is None else pressed.surface
+    renderer = Renderer(sensor, render, surface, albedo(plain, np.random.default_rng(0)), variant, measured)
+    positions = surface.material if pressed is None else pressed.positions
+    return encoded(expected_signal(renderer.radiance(positions, 0), sensor.camera), sensor.camera)
 
 
 def compare(frame: FloatArray, rendered: FloatArray, bare: BoolArray, sensor: Sensor) -> Comparison:
@@ -97,7 +106,7 @@ def picture(rows: dict[str, Comparison], title: str) -> bytes:
     for line, (name, row) in zip(axes, rows.items(), strict=True):
         difference = 0.5 + AMPLIFIED * (row.rendered - row.frame)
         errors = " ".join(f"{value:.1f}" for value in row.numbers()["mean_absolute_outside_dots"])
-        titles = (name, "fitted sensor, rendered", f"difference x {AMPLIFIED}; outside dots {errors} of 255")
+        titles = (name, "fitted sensor, rendered", f"difference x {AMPLIFIED}; compared, {errors} of 255")
         for axis, image, caption in zip(line, (row.frame, row.rendered, difference), titles, strict=True):
             axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
             axis.set_title(caption, fontsize=9)

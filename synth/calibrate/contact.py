@@ -24,7 +24,7 @@ _INSIDE, _TOUCHING = 0.7, 0.85
 """Least distance of the middle from the image's edges, and radius of the contact, over that of the slope that is seen:
 the gel slopes evenly a little beyond where it touches."""
 _LEAST_RISE, _LEAST_EXPLAINED = 6.0, 0.5
-"""Levels of 255 that a contact's strongest channel must rise, and the share of its change that planes must explain."""
+"""Levels of 255 that a contact's strongest channel must rise, and the share of its slopes that planes must explain."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,11 @@ class Contact:
 
     middle: tuple[float, float]
     radius: float
+
+    def away(self, shape: tuple[int, ...]) -> FloatArray:
+        """(H, W): distance of a picture's pixels from the middle, over the radius."""
+        y, x = np.mgrid[: shape[0], : shape[1]] + 0.5
+        return np.asarray(np.hypot(x - self.middle[0], y - self.middle[1]) / self.radius)
 
 
 def change(frame: FloatArray, rest: FloatArray, bare: BoolArray) -> FloatArray:
@@ -58,12 +63,13 @@ def find_contact(changed: FloatArray, name: str) -> Contact:
             within = values[inside]
             normal, moment = columns.T @ columns, columns.T @ within
             planes = np.linalg.solve(normal + 1e-9 * np.eye(3), moment)
-            tilted, whole = float(np.sum(moment[1:] * planes[1:])), float(np.sum(within**2))
-            score = tilted - (whole - float(np.sum(moment * planes)))
+            tilted = float(np.sum(moment[1:] * planes[1:]))
+            missed = float(np.sum(within**2) - np.sum(moment * planes))
+            score = tilted - missed
             if score > best[0]:
                 rise = radius * np.hypot(planes[1], planes[2]).max()
                 circle = Contact((float(middle[0]), float(middle[1])), float(_TOUCHING * radius))
-                best = score, circle, tilted / whole, rise
+                best = score, circle, tilted / (tilted + missed), rise
     if best[3] < _LEAST_RISE or best[2] < _LEAST_EXPLAINED:
         raise InputError(
             f"{name}: no ball's contact is seen in it; give frames of a ball pressed in, away from the edges"

@@ -72,7 +72,8 @@ class LitGel:
     """Pixels of the gel, ready to be lit: their centres (n, 2) float64 px see its undeformed or its pressed face.
 
     Of the sensor camera, window and coating count, not its pattern and lights; the variant is a vectorised one. A
-    pressed face, as a surface and its vertices' positions (v, 3) mm, throws shadows on itself.
+    pressed face, as a surface and its vertices' positions (v, 3) mm, throws shadows on itself. `points` and `normals`
+    (n, 3) are what the pixels see, mm, in the scene's frame.
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class LitGel:
             met = self._relief.ray_intersect(mi.Ray3f(ray))
             hit = np.array(met.is_valid())
             point, normal = np.where(hit, np.array(met.p), point), np.where(hit, -np.array(met.sh_frame.n), normal)
+        self.points, self.normals = (point * MIRROR[:, None]).T, (normal * MIRROR[:, None]).T
         weight = np.broadcast_to(np.array(weight), self._pixels)
         plane = reflecting_plane(sensor)
         self._reflects = plane is not None
@@ -122,6 +124,15 @@ class LitGel:
         """
         parts = self._parts(lights)
         return self._numpy(self._lit(parts, self._all_unshaded(parts, alone)))
+
+    def visible(self, lights: LightGeometry) -> FloatArray:
+        """(m, n): share of each light that the pressed face lets through; 1 where the face is turned away from it."""
+        parts, dr = self._parts(lights), self._dr
+        arm, pixel, _, _ = self._arms(parts)
+        away = dr.dot(dr.gather(self._mi.Vector3f, self._normal, pixel), arm) <= 0
+        free = dr.select(away, 1, self._unshaded(parts, ()))
+        share = np.array(dr.block_sum(free, _CELLS), dtype=np.float64) / _CELLS
+        return share.reshape(-1, self._count)[:, : self._pixels]
 
     def derivatives(self, lights: LightGeometry) -> FloatArray:
         """Derivatives of E (m, 9, n, 3) float64 by each light's centre, direction, size and angle, in forward mode.

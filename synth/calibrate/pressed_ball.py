@@ -7,6 +7,7 @@ import numpy as np
 from synth.arrays import FloatArray, Points
 from synth.errors import InputError
 from synth.scene import Scene, Sensor
+from synth.scene.validation import validated
 from synth.simulate import simulate
 from synth.simulate.press import MeshRule
 from synth.surface import GelSurface
@@ -30,14 +31,13 @@ class PressedBall:
 def press_ball(sensor: Sensor, radius_mm: float, depth_mm: float, place_mm: FloatArray, friction: float) -> PressedBall:
     """Simulate one press; InputError where the ball does not fit the gel, or the press does not complete."""
     x, y = (float(value) for value in place_mm)
-    scene = Scene.model_validate(
-        {
-            "name": "ball",
-            "sensor": sensor.model_dump(),
-            "contact": {"indenter": {"shape": "sphere", "radius_mm": radius_mm}, "friction": friction},
-            "motion": {"depth_mm": depth_mm, "position_mm": (x, y), "steps": 1},
-        }
-    )
+    content = {
+        "name": "ball",
+        "sensor": sensor.model_dump(),
+        "contact": {"indenter": {"shape": "sphere", "radius_mm": radius_mm}, "friction": friction},
+        "motion": {"depth_mm": depth_mm, "position_mm": (x, y), "steps": 1},
+    }
+    scene = validated(content, f"a ball of {radius_mm:g} mm pressed in by {depth_mm:.2g} mm", Scene)
     trajectory = simulate(scene, MeshRule.of(scene).resolution(scene).mesh)
     if trajectory.status != "complete":
         raise InputError(f"a ball of {radius_mm:g} mm pressed in by {depth_mm:.2g} mm: {trajectory.reason}")

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from synth.arrays import FloatArray
+from synth.calibrate.ball_fit import Press
 from synth.calibrate.comparison import Comparison
 from synth.calibrate.frames import Frames
 from synth.calibrate.sensor_fit import SensorFit
@@ -41,6 +43,7 @@ def numbers(
     fit: SensorFit,
     start: Sensor,
     rows: dict[str, Comparison],
+    contacts: Sequence[dict[str, Any]],
     verdict: Verdict,
     given: Frames,
     seconds: float,
@@ -56,6 +59,7 @@ def numbers(
         "residual_of_the_lights": round(255 * fit.lights.residual, 3),
         "verdict": asdict(verdict),
         "differences": {name: row.numbers() for name, row in rows.items()},
+        "contacts": list(contacts),
         "lights": _lights(fit, start),
         "camera": {key: getattr(camera, key) for key in _CAMERA},
         "coating": {
@@ -94,12 +98,41 @@ def _lights(fit: SensorFit, start: Sensor) -> list[dict[str, Any]]:
     return found
 
 
+def contact_numbers(press: Press, changed: FloatArray, shown: Comparison) -> dict[str, Any]:
+    """Of a ball's contact in a frame and in the fitted sensor, the latter by the change (n, 3) at the press's pixels.
+
+    Azimuths are in degrees, 0 to the right and 90 downward; rises, and what is missed within the circle, in levels of
+    255, by channel.
+    """
+    azimuth, rise = zip(press.azimuth_and_rise(press.changed), press.azimuth_and_rise(changed), strict=True)
+    miss = 255 * (shown.rendered - shown.frame)[shown.outside]
+    return {
+        "frame": press.name,
+        "middle_px": [round(value, 1) for value in press.contact.middle],
+        "radius_px": round(press.contact.radius, 1),
+        "place_mm": np.round(press.pose[:2], 3).tolist(),
+        "depth_mm": round(float(np.exp(press.pose[2])), 3),
+        "azimuth_deg": {"frame": np.round(azimuth[0], 1).tolist(), "fitted": np.round(azimuth[1], 1).tolist()},
+        "rise": {"frame": np.round(rise[0], 1).tolist(), "fitted": np.round(rise[1], 1).tolist()},
+        "rms_within": np.round(np.sqrt(np.mean(miss**2, axis=0)), 2).tolist(),
+    }
+
+
+def contact_line(numbers: dict[str, Any]) -> str:
+    """A contact's numbers in words."""
+    said = [f"{key} {' '.join(f'{x:.0f}' for x in numbers['azimuth_deg'][key])} degrees, rise "
+            f"{' '.join(f'{x:.0f}' for x in numbers['rise'][key])}" for key in ("frame", "fitted")]  # fmt: skip
+    return f"{Path(numbers['frame']).name} on the ball: light from (red green blue) {'; '.join(said)}"
+
+
 def summary(record: dict[str, Any]) -> list[str]:
     lines = [f"{record['preset']}: fitted in {record['seconds']} s, {record['steps']} steps of the lights' geometry"]
     for name, difference in record["differences"].items():
         line = f"mean absolute difference outside dots {_levels(difference['mean_absolute_outside_dots'])} of 255"
         floor = f"; the fitted frame itself, smoothed: {_levels(difference['floor'])}" if "floor" in difference else ""
         lines.append(f"{name}: {line} (red green blue){floor}")
+    for contact in record["contacts"]:
+        lines.append(f"{contact_line(contact)}; off by {_levels(contact['rms_within'])} (rms)")
     if "dots" in record:
         dots = record["dots"]
         lines.append(

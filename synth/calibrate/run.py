@@ -5,8 +5,9 @@ import json
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,15 @@ import tomli_w
 
 from synth.arrays import FloatArray
 from synth.calibrate.ball_fit import Balls
-from synth.calibrate.comparison import Comparison, compare, picture, render_undeformed
+from synth.calibrate.comparison import Comparison, compare, picture, render_gel
 from synth.calibrate.dot_grid import DotGridFit
 from synth.calibrate.frames import Frames, at_rest, read_frames
-from synth.calibrate.report import fitted_content, numbers, summary
+from synth.calibrate.measured import FILE, FLAT, fit_measured
+from synth.calibrate.measured import written as measured_files
+from synth.calibrate.pressed_ball import PressedBall
+from synth.calibrate.report import contact_line, contact_numbers, fitted_content, numbers, summary
 from synth.calibrate.rest_map import measured_rest_map, with_rest_map
-from synth.calibrate.sensor_fit import SensorFit, find_grid, fit_sensor
+from synth.calibrate.sensor_fit import SensorFit, find_bare, find_grid, fit_sensor
 from synth.calibrate.verdict import verdict
 from synth.dataset.images import encode_png
 from synth.dataset.storage import refuse_foreign, replace_file, storage_errors
@@ -47,15 +51,17 @@ def run_calibrate(
     steps: int,
     as_json: bool,
     rest_map: bool = False,
-    pressed: tuple[Sequence[Path], float | None] = ((), None),
+    pressed: tuple[Sequence[Path], Sequence[Path], float | None] = ((), (), None),
+    measured: bool = False,
 ) -> int:
     """Fit a preset to frames of a user's sensor; write OUT/scene.toml, calibration.png and calibration.json.
 
-    With `rest_map` also OUT/rest_map.png, which the scene then names, and comparisons with it.
+    With `rest_map` also OUT/rest_map.png, which the scene then names, and comparisons with it; with `measured` light as
+    measured, in two more files.
 
-    Arguments are the options of the command (`synth.cli`), `pressed` the frames of a ball and its radius; returns
-    0 if the fit is good, 1 if it is not. InputError where frames, preset or storage are at fault, or this machine has
-    no differentiable variant.
+    Arguments are the options of the command (`synth.cli`), `pressed` frames of a ball to fit, others to judge, and its
+    radius; returns 0 if the fit is good, 1 if it is not. InputError where frames, preset or storage are at fault, or
+    this machine has no differentiable variant.
     """
     started = time.perf_counter()
     template = load_scene(scene, assignments)
@@ -65,45 +71,76 @@ def run_calibrate(
         raise InputError(f"calibration differentiates the rendering, which needs LLVM or an NVIDIA GPU: {LLVM_HINT}")
     given, others = _read(frames, judge)
     start, balls = start_sensor(template, given.size), _balls(template, given, *pressed)
+    if measured and balls is None:
+        raise InputError("--measured: needs presses of a ball, which tell light on slopes; give --ball and --radius-mm")
     if spacing_mm is not None:
         _check_spacing(spacing_mm, start, scene)
     with storage_errors(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
     print("synth: fitting the sensor to the frames", file=sys.stderr, flush=True)
     fit = fit_sensor(start, given, variant, spacing_mm, steps, balls)
-    rows, grids = _compared(fit, render_undeformed(fit.sensor, render_settings(template), variant), given, others)
+    render, light = render_settings(template), None
+    if measured and balls is not None:
+        fit, light = fit_measured(fit, given, balls, variant)
+        render = render.model_copy(update={"light": "separated"})
+    show = partial(render_gel, fit.sensor, render, variant, light)
+    rows, grids = _compared(fit, show(), given, others)
+    shown, contacts = _contacts(fit, balls, show)
     found = verdict(rows, grids, fit.sensor, spacing_mm is not None, fit.pressed)
+    if light is not None:
+        for name, written in zip((FILE, FLAT), measured_files(light), strict=True):
+            replace_file(out / name, written)
     content = _checked_content(template, fit, out, scene)
+    if light is not None:
+        content["render"] = content.get("render", {}) | {"light": "separated"}
     if rest_map:
         gamma = fit.sensor.camera.gamma
         factors = measured_rest_map(rows["frames"], gamma)
         rows |= {f"{name}, with the rest map": with_rest_map(row, factors, gamma) for name, row in rows.items()}
         content["sensor"]["camera"]["rest_map"] = MAP
         replace_file(out / MAP, encode_png(factors))
-    record = numbers(template.name, frames, fit, start, rows, found, given, time.perf_counter() - started)
+    record = numbers(template.name, frames, fit, start, rows, contacts, found, given, time.perf_counter() - started)
     comment = f"# {MARK} --scene {scene}` to {len(frames)} frame(s); numbers in {NUMBERS}.\n"
     replace_file(out / SCENE, (comment + tomli_w.dumps(content)).encode())
-    replace_file(out / PICTURE, picture(rows, found.lines()[0]))
+    replace_file(out / PICTURE, picture(rows | shown, found.lines()[0]))
     replace_file(out / NUMBERS, (json.dumps(record, indent=1) + "\n").encode())
     text = "\n".join([*summary(record), f"written: {out / SCENE}", *found.lines()])
     print(json.dumps(record) if as_json else text)
     return 0 if found.good else 1
 
 
-def _balls(template: Template, given: Frames, paths: Sequence[Path], radius_mm: float | None) -> Balls | None:
+def _balls(
+    template: Template, given: Frames, fitted: Sequence[Path], judged: Sequence[Path], radius_mm: float | None
+) -> Balls | None:
     """The frames of a ball, None without any."""
-    if not paths and radius_mm is None:
+    if not fitted and not judged and radius_mm is None:
         return None
-    if not paths or radius_mm is None or not 0.3 <= radius_mm <= 100:
+    if not fitted or radius_mm is None or not 0.3 <= radius_mm <= 100:
         raise InputError(
             "--ball and --radius-mm belong together: frames of one ball, and its radius from 0.3 to 100 mm"
         )
-    frames = {str(path): read_frames([path]) for path in paths}
+    frames = {str(path): read_frames([path]) for path in (*fitted, *judged)}
     for name, one in frames.items():
         if one.size != given.size:
             raise InputError(f"{name}: has {one.size} pixels, the frames at rest have {given.size}")
+    only_judged = frozenset(map(str, judged)) - frozenset(map(str, fitted))
     friction = template.corners[0].contact.friction
-    return Balls({name: one.encoded for name, one in frames.items()}, radius_mm, friction)
+    return Balls({name: one.encoded for name, one in frames.items()}, radius_mm, friction, only_judged)
+
+
+def _contacts(
+    fit: SensorFit, balls: Balls | None, show: Callable[[PressedBall], FloatArray]
+) -> tuple[dict[str, Comparison], list[dict[str, Any]]]:
+    """Each press rendered and compared within its circle, by what its numbers say, and these numbers."""
+    shown, contacts = {}, []
+    if balls is not None and fit.pressed is not None:
+        for press, changed in zip(fit.pressed.presses, fit.pressed.fitted, strict=True):
+            frame = balls.frames[press.name]
+            bare = fit.bare & find_bare(fit.sensor, frame) & (press.contact.away(frame.shape) < 1)
+            row = compare(frame, show(press.ball(fit.sensor, balls)), bare, fit.sensor)
+            contacts.append(contact_numbers(press, changed, row))
+            shown[contact_line(contacts[-1]).replace(": ", "\n").replace("; ", "\n")] = row
+    return shown, contacts
 
 
 def middle(kind: str, arguments: list[Any]) -> Any:
@@ -163,7 +200,7 @@ def _check_places(template: Template, out: Path) -> None:
     gel = template.corners[0].sensor.gel
     if not gel.is_flat:
         raise InputError(f"{template.label}: sensor.gel.shape: calibrate fits flat gels only, not a {gel.shape}")
-    refuse_foreign(out / SCENE, MARK.encode(), out / PICTURE, out / NUMBERS, out / MAP)
+    refuse_foreign(out / SCENE, MARK.encode(), out / PICTURE, out / NUMBERS, out / MAP, out / FILE, out / FLAT)
     if (out / SCENE).resolve() == template.source.resolve():
         raise InputError(f"--out {out}: its {SCENE} is what --scene starts from and would be lost; give another --out")
 

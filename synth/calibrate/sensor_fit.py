@@ -69,7 +69,7 @@ def fit_sensor(
     if not len(pixels):
         raise InputError("no pixel between the dots sees the gel of the preset; check its sensor.gel and sensor.camera")
     at = (pixels[:, 1].astype(int), pixels[:, 0].astype(int))
-    smooth = _smoothed(frames.encoded, bare)[at]
+    smooth = smoothed(frames.encoded, bare)[at]
     gel = LitGel(sensor, pixels, variant)
     target = _target(smooth, sensor.camera, pixels)
     shines = np.array([light.color for light in sensor.lights]) > 0
@@ -82,7 +82,7 @@ def fit_sensor(
     pressed = None
     if balls is not None:
         beside = {name: bare & find_bare(sensor, frame) for name, frame in balls.frames.items()}
-        presses = find_presses(sensor, balls, _smoothed(frames.encoded, bare), beside)
+        presses = find_presses(sensor, balls, smoothed(frames.encoded, bare), beside)
         pressed = fit_balls(sensor, gel, target, fit, shines, room, presses, balls, variant, steps)
         fit = pressed.lights
     read, shot = fit_noise(frames.single, bare, gamma, frames.step)
@@ -142,7 +142,7 @@ def _target(encoded: FloatArray, camera: Camera, pixels: Pixels) -> Target:
     return Target(encoded**camera.gamma, slope, camera.exposure, off_centre(camera, *pixels.T))
 
 
-def _smoothed(encoded: FloatArray, bare: BoolArray) -> FloatArray:
+def smoothed(encoded: FloatArray, bare: BoolArray) -> FloatArray:
     """Means (H, W, 3) over bare pixels near by, which takes noise away and leaves shading."""
     weight = cv2.GaussianBlur(bare.astype(np.float64), (0, 0), 1.5)
     blurred = cv2.GaussianBlur(encoded * bare[:, :, None], (0, 0), 1.5)

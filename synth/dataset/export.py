@@ -8,6 +8,7 @@
     npz         000000.npz with image1, image2, and the arrays below
     webdataset  shard-000000.tar of at most 512 samples: 000000.{image1.png, image2.png, json}, the latter meta.json,
                 and an .npy of each array below but meta
+    hdf5        of clips, see `synth.dataset.hdf5`; the others are of pairs
 
 The arrays are forward, forward_visible, backward, backward_visible, the optional channels by their EXR names, force_n
 and torque_nmm (2, 3), per image, and meta, the text of meta.json. In flo and kitti they are in extra/000000.npz. No
@@ -31,16 +32,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.arrays import BoolArray
+from synth.dataset.hdf5 import add_clip
 from synth.dataset.images import Raster, encode_png
 from synth.dataset.jsontext import to_document
 from synth.dataset.npz import encode_npz
-from synth.dataset.reader import Dataset, SampleData, read_dataset
-from synth.dataset.sample import SAMPLES_FOLDER, further_cameras, sample_name
+from synth.dataset.reader import Dataset, read_dataset
+from synth.dataset.sample import further_cameras, sample_name
+from synth.dataset.sample_reader import SampleData
 from synth.dataset.storage import PARTIAL
 from synth.errors import InputError
 from synth.flow.field import FlowArray
 
-ExportFormat = Literal["flo", "kitti", "npz", "webdataset"]
+ExportFormat = Literal["flo", "kitti", "npz", "webdataset", "hdf5"]
 SAMPLES_PER_SHARD = 512
 _UNKNOWN_FLOW = np.float32(1e10)
 _KITTI_SCALE, _KITTI_ZERO = 64.0, 32768.0
@@ -65,13 +68,17 @@ def export(
         How many samples were written.
 
     Raises:
-        InputError: Unknown camera, `out` is not empty, no finished sample, a damaged file, a flow beyond
-            KITTI's range, or the storage refuses.
+        InputError: Unknown camera, a format that the samples cannot have, `out` is not empty, no finished sample, a
+            damaged file, a flow beyond KITTI's range, or the storage refuses.
     """
     final = Path(out).absolute()
     dataset = read_dataset(path)
     if not dataset.samples:
         raise InputError(f"{dataset.path}: has no finished sample to export")
+    if dataset.layout.is_of_clips != (format == "hdf5") or not (dataset.layout.has_images or format == "hdf5"):
+        held = "clips" if dataset.layout.is_of_clips else "pairs" if dataset.layout.has_images else "no images"
+        fitting = {"clips": "hdf5", "pairs": "flo, kitti, npz, webdataset"}.get(held, "none; read it in Python")
+        raise InputError(f"{dataset.path}: holds {held}, which --format {format} is not for; allowed: {fitting}")
     if final.exists() and (not final.is_dir() or any(final.iterdir())):
         raise InputError(f"{final}: exists and is not empty; export never overwrites, give another --out")
     partial = final.with_name(f".{final.name}{PARTIAL}export")
@@ -94,7 +101,10 @@ def export(
 
 def left_out(path: Path | str, camera: str = "") -> str:
     """What an export of one camera leaves out of a dataset, in words."""
-    cameras = ["the main camera", *further_cameras(read_dataset(path).info["scene"])]
+    dataset = read_dataset(path)
+    if dataset.layout.is_of_clips:
+        return "surface.npz (the gel's surface, for verify), backward flow"
+    cameras = ["the main camera", *further_cameras(dataset.info["scene"])]
     others = [name for name in cameras if name != (camera or cameras[0])]
     return ", ".join(["surface.npz (the gel's surface, for verify)", *(f"pairs of {name}" for name in others)])
 
@@ -103,10 +113,16 @@ def _write_all(dataset: Dataset, format: ExportFormat, out: Path, progress: Prog
     """Writes sample after sample; OSError where the storage refuses."""
     if format == "flo":  # torchvision wants two lines at least
         (out / "FlyingChairs_train_val.txt").write_text("1\n" * max(2, len(dataset.samples)))
-    write = {"flo": _write_flo, "kitti": _write_kitti, "npz": _write_npz, "webdataset": _append_to_shard}[format]
     total = len(dataset.samples)
+    if format == "hdf5":
+        for done, index in enumerate(dataset.samples, 1):
+            add_clip(out, {name: dataset.read_clip(index, name) for name in dataset.layout.cameras})
+            if progress is not None:
+                progress(done, total)
+        return
+    write = {"flo": _write_flo, "kitti": _write_kitti, "npz": _write_npz, "webdataset": _append_to_shard}[format]
     for done, index in enumerate(dataset.samples):
-        source = dataset.path / SAMPLES_FOLDER / sample_name(index) / camera
+        source = dataset.folder(index) / camera
         target = out / f"shard-{done // SAMPLES_PER_SHARD:06d}.tar" if format == "webdataset" else out
         write(target, sample_name(index), source, dataset.read(index, camera))
         if progress is not None:
@@ -166,7 +182,10 @@ def _write_kitti(out: Path, name: str, source: Path, sample: SampleData) -> None
 
 
 def _write_npz(out: Path, name: str, source: Path, sample: SampleData) -> None:
-    _put(out / f"{name}.npz", encode_npz({"image1": sample.image1, "image2": sample.image2, **_arrays(sample)}))
+    _put(
+        out / f"{name}.npz",
+        encode_npz({**dict(zip(("image1", "image2"), sample.images, strict=True)), **_arrays(sample)}),
+    )
 
 
 def _append_to_shard(shard: Path, name: str, source: Path, sample: SampleData) -> None:

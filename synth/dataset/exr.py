@@ -1,5 +1,7 @@
 """`flow.exr`: an exact flow as an OpenEXR image, float32, ZIP-compressed.
 
+Of a clip `flow/000001.exr`, whose image 1 is frame 0 and image 2 frame 1.
+
 Channels (of two directions, both read `I1(x) = I2(x + forward(x))`, `I2(x) = I1(x + backward(x))`):
 
     forward.U forward.V forward.visible   backward.U backward.V backward.visible
@@ -62,6 +64,15 @@ OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
         "MPa, frame of the scene; force of the indenter on the gel per undeformed area, in image 2's state; in image 1",
     ),
     "contact": (("contact.Y",), "1 where the indenter touches in image 2's state, else 0; in image 1"),
+    "slip": (
+        ("slip.Y",),
+        "1 where the point moved along the indenter since the frame before, 0 where it stuck, NaN without contact; in "
+        "image 1",
+    ),
+    "previous": (
+        ("previous.U", "previous.V", "previous.visible"),
+        "px; as forward, from the frame before image 2 to image 2, in the frame before",
+    ),
 }
 """Names of channels, and their unit, frame, state and image, by the key of `[outputs]` that asks for them."""
 
@@ -72,15 +83,19 @@ def write_flow(path: Path, flow: FlowField, attributes: Mapping[str, str | int])
     `attributes`, whose integers must fit 32 bits, stand in the header beside `CONVENTIONS`. OSError where the storage
     refuses.
     """
-    import OpenEXR
-
     planes = channels_of(flow)
     planes |= {alias: planes[name] for alias, name in ALIASES.items()}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     meanings = {f"channels.{key}": meaning for key, (names, meaning) in OPTIONAL.items() if set(names) <= set(planes)}
-    header |= {**CONVENTIONS, **meanings, **attributes}
+    write_channels(path, planes, {**CONVENTIONS, **meanings, **attributes})
+
+
+def write_channels(path: Path, planes: Mapping[str, FlowArray], attributes: Mapping[str, str | int]) -> None:
+    """Writes planes (H, W) float32 by channel name; otherwise as `write_flow`."""
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}
     try:
-        OpenEXR.File(header, planes).write(str(path))
+        OpenEXR.File(header, dict(planes)).write(str(path))
     except RuntimeError as error:  # How the library reports a failing disk.
         raise OSError(str(error)) from error
 

@@ -35,7 +35,7 @@ class ManifestEntry:
 
     index: int
     trajectory: int
-    frames: tuple[int, int]
+    frames: tuple[int, ...]
     seed: int
     sha256: Mapping[str, str]
     seconds: Mapping[str, float]

@@ -13,9 +13,10 @@ from synth.dataset.job import Job
 from synth.dataset.jsontext import jsonable, to_document
 from synth.dataset.manifest import ManifestEntry
 from synth.dataset.npz import encode_npz
-from synth.dataset.sample import SAMPLES_FOLDER, Sample, largest_motion, sample_name
+from synth.dataset.sample import Layout, Sample, largest_motion, sample_name
 from synth.dataset.storage import install_folder, partial_name, storage_errors
 from synth.dataset.store import Output, Store
+from synth.dataset.tracks import MARKERS, MARKERS_FILE, STATES, STATES_FILE, encode_table, states_of
 
 SOLVER_MEANINGS = {
     "solver.slip_ratio": "of the area in contact, the part that slid over the indenter in the last load step, 0 to 1",
@@ -24,37 +25,48 @@ SOLVER_MEANINGS = {
 
 
 def write_sample_files(out: Output, sample: Sample, job: Job) -> ManifestEntry:
-    """Writes samples/NNNNNN, in a directory whole or not at all; equal samples give equal bytes (without times).
+    """Writes samples/NNNNNN or clips/NNNNNN, in a directory whole or not at all; equal samples give equal bytes.
 
     An older folder of that number is replaced: without a line in the manifest it counts as unfinished. The dataset was
     opened by a `DatasetWriter` of some process; under a URL the files are made in a folder of this machine's temporary
-    space and copied. The job is for the header of flow.exr. Returns what `DatasetWriter.record` appends to the
+    space and copied. The job is for the header of flow files. Returns what `DatasetWriter.record` appends to the
     manifest, but for the times. InputError where the storage refuses (disk full, no permission).
     """
-    store, name = Store(out), f"{SAMPLES_FOLDER}/{sample_name(sample.index)}"
+    store, layout = Store(out), Layout.of(job.scene)
+    name = f"{layout.folder}/{sample_name(sample.index)}"
     if store.directory is not None:
-        return _write_folder(store.directory / name, sample, job)
+        return _write_folder(store.directory / name, sample, job, layout)
     with tempfile.TemporaryDirectory(prefix="synth-") as temporary:
-        entry = _write_folder(Path(temporary) / name, sample, job)
+        entry = _write_folder(Path(temporary) / name, sample, job, layout)
         store.put(Path(temporary) / name, name)
     return entry
 
 
-def _write_folder(final: Path, sample: Sample, job: Job) -> ManifestEntry:
+def _write_folder(final: Path, sample: Sample, job: Job, layout: Layout) -> ManifestEntry:
     """The sample's folder, written aside, flushed and renamed into place."""
     partial = partial_name(final)
-    files = {"meta.json": to_document(_meta(sample, job)).encode("utf-8"), "surface.npz": _surface(sample)}
-    views = {"": sample, **sample.further}
+    motions = []
     with storage_errors(final):
         try:
-            partial.mkdir(parents=True)
-            for name, content in files.items():
-                (partial / name).write_bytes(content)
-            for camera, pair in views.items():
-                (partial / camera).mkdir(exist_ok=True)
-                for name, image in (("image1.png", pair.image1), ("image2.png", pair.image2)):
-                    (partial / camera / name).write_bytes(encode_png(image))
-                write_flow(partial / camera / "flow.exr", pair.flow, _attributes(sample, job, camera))
+            for name in layout.files(len(sample.frames)):
+                (partial / name).parent.mkdir(parents=True, exist_ok=True)
+            for camera, seen in sample.cameras.items():
+                for frame, image in enumerate(seen.images):
+                    (partial / camera / layout.image(frame)).write_bytes(encode_png(image))
+                for frame, flow in enumerate(seen.flows, 1):
+                    shown = (sample.frames[0], sample.frames[frame])
+                    path = partial / camera / layout.flow(frame)
+                    write_flow(path, flow, _attributes(sample, job, camera, shown))
+                    motions += [largest_motion(flow)] if not camera else []
+                if layout.is_of_clips:
+                    (partial / camera / MARKERS_FILE).write_bytes(encode_table(MARKERS, seen.markers))
+            if layout.is_of_clips:
+                rate = sample.scene.sampling.frames_per_second
+                rows = states_of(sample.diagnostics["solver"], sample.force_n, sample.torque_nmm, rate)
+                (partial / STATES_FILE).write_bytes(encode_table(STATES, rows))
+            longest = max((motion for motion in motions if motion is not None), default=None)
+            (partial / "meta.json").write_bytes(to_document(_meta(sample, job, longest)).encode("utf-8"))
+            (partial / "surface.npz").write_bytes(_surface(sample, layout))
             written = sorted(file for file in partial.rglob("*") if file.is_file())
             sha256 = {
                 file.relative_to(partial).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest() for file in written
@@ -73,12 +85,12 @@ def _write_folder(final: Path, sample: Sample, job: Job) -> ManifestEntry:
         diagnostics=jsonable(sample.diagnostics),
         force_n=tuple(tuple(row) for row in np.asarray(sample.force_n, np.float64).tolist()),
         torque_nmm=tuple(tuple(row) for row in np.asarray(sample.torque_nmm, np.float64).tolist()),
-        max_flow_px=largest_motion(sample.flow),
+        max_flow_px=longest,
     )
 
 
-def _attributes(sample: Sample, job: Job, camera: str) -> dict[str, str | int]:
-    """Header attributes of flow.exr. The seed is text: OpenEXR's integers have 32 bits."""
+def _attributes(sample: Sample, job: Job, camera: str, shown: tuple[int, int]) -> dict[str, str | int]:
+    """Header attributes of a flow file between two frames. The seed is text: OpenEXR's integers have 32 bits."""
     named = {"camera": camera} if camera else {}
     return {
         **named,
@@ -87,14 +99,15 @@ def _attributes(sample: Sample, job: Job, camera: str) -> dict[str, str | int]:
         "seed": str(sample.seed),
         "index": sample.index,
         "trajectory": sample.trajectory,
-        "frames": f"{sample.frames[0]} {sample.frames[1]}",
+        "frames": f"{shown[0]} {shown[1]}",
         "software": ", ".join(f"{name} {version}" for name, version in job.software.items()),
     }
 
 
-def _meta(sample: Sample, job: Job) -> dict[str, object]:
-    """meta.json: everything but the times."""
-    height, width = sample.image1.shape[:2]
+def _meta(sample: Sample, job: Job, longest: float | None) -> dict[str, object]:
+    """meta.json: everything but the times; `longest` is the largest motion, px."""
+    main = sample.cameras[""]
+    image = main.images[0] if main.images else None
     return {
         "index": sample.index,
         "trajectory": sample.trajectory,
@@ -102,12 +115,12 @@ def _meta(sample: Sample, job: Job) -> dict[str, object]:
         "seed": sample.seed,
         "scene_hash": job.scene_hash,
         "image": {
-            "width": width,
-            "height": height,
-            "channels": 1 if sample.image1.ndim == 2 else 3,
-            "bits": 8 * sample.image1.itemsize,
+            "width": main.size[1],
+            "height": main.size[0],
+            "channels": None if image is None else 1 if image.ndim == 2 else 3,
+            "bits": None if image is None else 8 * image.itemsize,
         },
-        "max_flow_px": largest_motion(sample.flow),
+        "max_flow_px": longest,
         "force_n": sample.force_n,
         "torque_nmm": sample.torque_nmm,
         "diagnostics": sample.diagnostics,
@@ -116,14 +129,12 @@ def _meta(sample: Sample, job: Job) -> dict[str, object]:
     }
 
 
-def _surface(sample: Sample) -> bytes:
+def _surface(sample: Sample, layout: Layout) -> bytes:
     """surface.npz: what the flow was traced on, so that it can be derived again without the solver."""
-    return encode_npz(
-        {
-            "nodes": sample.surface.coarse.nodes,
-            "faces": sample.surface.coarse.faces,
-            "subdivisions": np.array(sample.surface.subdivisions),
-            "displacement1": np.asarray(sample.displacement1, np.float64),
-            "displacement2": np.asarray(sample.displacement2, np.float64),
-        }
-    )
+    moved = [np.asarray(displacement, np.float64) for displacement in sample.displacements]
+    displacements = {"displacements": np.array(moved)}
+    if not layout.is_of_clips:
+        displacements = {f"displacement{number}": one for number, one in enumerate(moved, 1)}
+    coarse = sample.surface.coarse
+    parts = np.array(sample.surface.subdivisions)
+    return encode_npz({"nodes": coarse.nodes, "faces": coarse.faces, "subdivisions": parts, **displacements})

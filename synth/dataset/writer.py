@@ -3,8 +3,10 @@
     DIR/dataset.json      the job
     DIR/manifest.jsonl    a line per finished sample
     DIR/failures.jsonl    a line per failed attempt
-    DIR/samples/000000/   image1.png image2.png flow.exr meta.json surface.npz, and for each further camera a folder of
-                          its name with its own image1.png image2.png flow.exr
+    DIR/samples/000000/   of pairs: image1.png image2.png flow.exr meta.json surface.npz, and for each further camera
+                          a folder of its name with its own image1.png image2.png flow.exr
+    DIR/clips/000000/     of clips: frames/000000.png ... flow/000001.exr ... markers.csv states.csv meta.json
+                          surface.npz, and for each further camera a folder with its own frames, flow and markers.csv
     DIR/summary.json      what it took
     DIR/meshes/           of pads with an even edge length
     DIR/.lock             held by the processes that write; under a URL notes in leases/
@@ -27,7 +29,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from synth.dataset.job import DATASET_FILE, Job, check_record, continued, refuse_another_job
-from synth.dataset.jsontext import parse_document, to_document, to_line
+from synth.dataset.jsontext import parse_document, read_document, to_document, to_line
 from synth.dataset.lock import LEASES_FOLDER, LOCK_FILE, DirectoryLock, Lease
 from synth.dataset.manifest import (
     FAILURES_FILE,
@@ -40,7 +42,7 @@ from synth.dataset.manifest import (
     merge_lines,
     scan_lines,
 )
-from synth.dataset.sample import SAMPLE_FILES, SAMPLES_FOLDER, VIEW_FILES, further_cameras, sample_name
+from synth.dataset.sample import Layout, sample_name
 from synth.dataset.shard import Shard
 from synth.dataset.storage import PARTIAL, remove_partials, storage_errors
 from synth.dataset.store import MESHES_FOLDER, Store, mesh_folder
@@ -67,21 +69,22 @@ class DatasetWriter:
     run: Mapping[str, Any] | None = None
     """What `finalise` writes to summary.json about this run, beside the totals of the dataset."""
 
-    def __init__(self, out: Path | str, job: Job, shard: Shard | None = None, pairs_per_trajectory: int = 1) -> None:
+    def __init__(self, out: Path | str, job: Job, shard: Shard | None = None, per_trajectory: int = 1) -> None:
         """Creates the dataset, or goes on with the job that is there.
 
         Args:
             out: a directory or a URL: empty, missing, or a dataset of the same job (n may differ).
             job: what to write; the same for all shards.
             shard: the part of the job that this process makes; None for all of it.
-            pairs_per_trajectory: samples i, i + 1, ... of that number belong to a trajectory, and so to one shard.
+            per_trajectory: samples i, i + 1, ... of that number belong to a trajectory, and so to one shard.
 
         Raises:
             InputError: The place holds another job (the message lists what differs) or something else, another process
                 is writing it or this shard, it is being made in another number of shards, its manifest is damaged, or
                 the storage refuses.
         """
-        self._store, self.job, self._shard, self._pairs = Store(out), job, shard, pairs_per_trajectory
+        self._store, self.job, self._shard, self._per_trajectory = Store(out), job, shard, per_trajectory
+        self._layout = Layout.of(job.scene)
         self._directory = self._store.directory
         self._check_place()
         self._closing = contextlib.ExitStack()
@@ -121,8 +124,8 @@ class DatasetWriter:
         name = sample_name(entry.index)
         if not self._is_whole(entry.index):
             raise InputError(
-                f"{self._store.out}/{SAMPLES_FOLDER}/{name}: the sample's files are not there; were they written to "
-                "another place, or to storage that is not shared?"
+                f"{self._store.out}/{self._layout.folder}/{name}: the sample's files are not there; were they written "
+                "to another place, or to storage that is not shared?"
             )
         self._append(MANIFEST_FILE, name, vars(entry))
         self._finished.add(entry.index)
@@ -241,9 +244,9 @@ class DatasetWriter:
         shards = self._whole / SHARDS_FOLDER
         if self._directory is not None:
             with storage_errors(self._directory):
-                (self._directory / SAMPLES_FOLDER).mkdir(exist_ok=True)
+                (self._directory / self._layout.folder).mkdir(exist_ok=True)
                 remove_partials(self._directory)
-                remove_partials(self._directory / SAMPLES_FOLDER)
+                remove_partials(self._directory / self._layout.folder)
         homes = sorted(shards.glob("*-of-*"))
         finished = merge_lines(
             self._whole / MANIFEST_FILE,
@@ -262,7 +265,7 @@ class DatasetWriter:
         folder = directory / SHARDS_FOLDER
         self._own = folder / shard.name
         with storage_errors(self._own):
-            (directory / SAMPLES_FOLDER).mkdir(exist_ok=True)
+            (directory / self._layout.folder).mkdir(exist_ok=True)
             others = [home.name for home in folder.iterdir()] if folder.is_dir() else []
             strange = [name for name in others if not name.endswith(f"-of-{shard.count}")]
             if strange:
@@ -271,7 +274,7 @@ class DatasetWriter:
                 )
             self._own.mkdir(parents=True, exist_ok=True)
             remove_partials(self._own)
-            remove_partials(directory / SAMPLES_FOLDER, lambda name: name.isdecimal() and self._makes(int(name)))
+            remove_partials(directory / self._layout.folder, lambda name: name.isdecimal() and self._makes(int(name)))
         recorded = {*scan_lines(self._whole / MANIFEST_FILE, manifest_key).places}
         recorded |= merge_lines(self._own / MANIFEST_FILE, manifest_key)
         failed = {*scan_lines(self._whole / FAILURES_FILE, failure_key).places}
@@ -279,12 +282,17 @@ class DatasetWriter:
         return {index for index in recorded if self._makes(index) and self._is_whole(index)}, failed
 
     def _makes(self, index: int) -> bool:
-        return self._shard is None or self._shard.makes(index // self._pairs)
+        return self._shard is None or self._shard.makes(index // self._per_trajectory)
 
     def _is_whole(self, index: int) -> bool:
         """Whether a sample's files are there; under a URL its last one."""
+        name = f"{self._layout.folder}/{sample_name(index)}"
         if self._directory is None:
-            return self._store.exists(f"{SAMPLES_FOLDER}/{sample_name(index)}/meta.json")
-        folder = self._directory / SAMPLES_FOLDER / sample_name(index)
-        names = [f"{camera}/{name}" for camera in further_cameras(self.job.scene) for name in VIEW_FILES]
-        return all((folder / name).is_file() for name in (*SAMPLE_FILES, *names))
+            return self._store.exists(f"{name}/meta.json")
+        folder, frames = self._directory / name, 2
+        if self._layout.is_of_clips:
+            try:
+                frames = len(read_document(folder / "meta.json")["frames"])
+            except (InputError, KeyError, TypeError):
+                return False
+        return all((folder / file).is_file() for file in self._layout.files(frames))

@@ -86,3 +86,31 @@ def exact_flow(
     if not backward or hits2 is None:
         return FlowField(forward, forward_visible, extras=extras)
     return FlowField(forward, forward_visible, *view.motion(hits2, positions1), extras=extras)
+
+
+def since_before(
+    view: View,
+    first: Points,
+    before: Points,
+    now: Points,
+    *,
+    previous: bool = False,
+    slip: Callable[[Points, Points, Points], FloatArray] | None = None,
+) -> dict[str, FlowArray]:
+    """Channels of a clip's frame that say what happened since the frame before.
+
+    The states are the first, the one before and this one, vertices (v, 3) float64 mm. `previous` gives
+    previous.U/V/visible, the forward flow from the state before at its own pixels. `slip` says which material points
+    slipped, 1, 0 or NaN, by their places (n, 3) mm undeformed, before and now, and gives slip.Y at the first's pixels.
+    """
+    found: dict[str, FlowArray] = {}
+    if previous:
+        motion, visible = view.motion(view.state(before).hits, now)
+        found |= {"previous.U": motion[..., 0], "previous.V": motion[..., 1], "previous.visible": visible}
+    if slip is not None:
+        hits = view.state(first).hits
+        places = [hits.interpolate(view.surface.triangles, at) for at in (view.surface.material, before, now)]
+        on_gel, slipped = np.isfinite(places[2][:, 0]), np.full(len(places[2]), np.nan)
+        slipped[on_gel] = slip(*(place[on_gel] for place in places))
+        found["slip.Y"] = view.image(slipped)
+    return found

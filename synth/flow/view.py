@@ -63,10 +63,10 @@ class View:
 
     def state(self, positions: Points) -> "SeenState":
         """The surface in a state (v, 3) mm; the array must not be changed afterwards."""
-        for known in self._seen:
-            if known.positions is positions:
-                return known
-        self._seen.append(SeenState(self, positions))
+        known = next((one for one in self._seen if one.positions is positions), None)
+        if known is not None:
+            self._seen.remove(known)  # the last that was asked for is kept longest
+        self._seen.append(known or SeenState(self, positions))
         return self._seen[-1]
 
     def motion(self, hits: Hits, target: Points) -> tuple[FlowArray, FlowArray]:
@@ -76,13 +76,8 @@ class View:
         motion, visible = np.empty((width * height, 2), dtype=np.float32), np.empty(width * height, dtype=np.float32)
         for tile in self.tiles():
             points, path = hits[tile].interpolate(self.surface.triangles, target), optics.own.path[tile]
-            pixels = optics.project(points, path)
+            pixels, visible[tile] = state.look_at(points, path)
             motion[tile] = pixels - optics.centres[tile]
-            seen = optics.is_inside(pixels)
-            if (doubtful := state.doubtful(pixels, seen)).size:
-                rays = optics.look(pixels[doubtful])
-                seen[doubtful] = (rays.path == path[doubtful]) & state.is_unobstructed(points[doubtful], rays)
-            visible[tile] = seen
         return motion.reshape(height, width, 2), visible.reshape(height, width)
 
     def tiles(self) -> Iterator[slice]:
@@ -120,6 +115,16 @@ class SeenState:
     @cached_property
     def _overlap(self) -> BoolArray | None:
         return self.view.overlap(self.positions)
+
+    def look_at(self, points: Points, path: NDArray[np.intp]) -> tuple[Pixels, BoolArray]:
+        """Pixels (n, 2) of points (n, 3) mm of the state by paths (n,), and whether these show them."""
+        optics = self.view.optics
+        pixels = optics.project(points, path)
+        seen = optics.is_inside(pixels)
+        if (doubtful := self.doubtful(pixels, seen)).size:
+            rays = optics.look(pixels[doubtful])
+            seen[doubtful] = (rays.path == path[doubtful]) & self.is_unobstructed(points[doubtful], rays)
+        return pixels, seen
 
     def doubtful(self, pixels: Pixels, inside: BoolArray) -> NDArray[np.intp]:
         """Numbers of the points, seen in pixels (n, 2) if `inside`, whose visibility must be traced."""

@@ -1,6 +1,7 @@
-"""One HTML file that needs nothing else: pictures inline as base64 PNG, arrows as SVG, no script."""
+"""One HTML file that needs nothing else: pictures inline as base64 PNG, films as WebP, arrows as SVG, no script."""
 
 import base64
+import io
 from functools import cache
 from html import escape
 from pathlib import Path
@@ -11,8 +12,9 @@ from numpy.typing import NDArray
 
 from synth.dataset.images import encode_png
 from synth.dataset.storage import replace_file
+from synth.inspect.clips import pictures_of
 from synth.inspect.inspection import Inspection
-from synth.inspect.panels import CLOSURE_RANGE_PX, Arrows, Panel, panels_of, wheel_legend
+from synth.inspect.panels import CLOSURE_RANGE_PX, Arrows, Panel, Rgb, wheel_legend
 from synth.inspect.text import COLUMNS, about_rows, facts
 from synth.inspect.view import View
 
@@ -20,6 +22,8 @@ PAGE_MARK = "<title>synth: "
 """Text in each page's head, by which our pages are known."""
 PICTURED = 24
 """Samples (and cameras) of a dataset that are shown with pictures, evenly spaced."""
+QUALITY = 85
+"""Of a film's compression, of 100."""
 
 _STYLE = """
 :root { color-scheme: light dark; --line: #8885; --soft: #8881; }
@@ -33,7 +37,7 @@ table.rows tr > * { border-bottom: 1px solid var(--line); }
 table.rows td:first-child, table.rows th:first-child { text-align: left; }
 .scroll { overflow-x: auto; }
 .pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(270px, 1fr)); gap: 1rem; }
-figure { margin: 0; } figcaption { font-size: .85rem; padding: .25rem 0; }
+figure { margin: 0; } figure.film { grid-column: span 2; } figcaption { font-size: .85rem; padding: .25rem 0; }
 .frame { position: relative; line-height: 0; border: 1px solid var(--line); }
 .frame img.picture, .frame svg { width: 100%; image-rendering: pixelated; }
 .frame svg { position: absolute; inset: 0; height: 100%; }
@@ -102,15 +106,17 @@ def _facts(rows: list[tuple[str, str]]) -> str:
 
 
 def _pictures(view: View, numbers: dict[str, Any]) -> str:
-    return f'<div class="pictures">{"".join(_figure(panel) for panel in panels_of(view, numbers))}</div>'
+    return f'<div class="pictures">{"".join(_figure(panel) for panel in pictures_of(view, numbers))}</div>'
 
 
 def _figure(panel: Panel) -> str:
     caption = escape(panel.caption)
     wheel = _wheel() if panel.has_wheel else ""
     arrows = "" if panel.arrows is None else _arrows(panel.arrows, panel.picture.shape[1], panel.picture.shape[0])
-    image = f'<img class="picture" alt="{caption}" src="{_inline(panel.picture)}">'
-    return f'<figure><div class="frame">{image}{arrows}{wheel}</div><figcaption>{caption}</figcaption></figure>\n'
+    source = _inline(panel.picture) if panel.film is None else _inline_film(panel.film(), panel.rate)
+    image = f'<img class="picture" alt="{caption}" src="{source}">'
+    wide = "" if panel.film is None else ' class="film"'
+    return f'<figure{wide}><div class="frame">{image}{arrows}{wheel}</div><figcaption>{caption}</figcaption></figure>\n'
 
 
 def _arrows(arrows: Arrows, width: int, height: int) -> str:
@@ -128,6 +134,16 @@ def _arrows(arrows: Arrows, width: int, height: int) -> str:
 
 def _inline(picture: NDArray[np.uint8]) -> str:
     return f"data:image/png;base64,{base64.b64encode(encode_png(picture)).decode('ascii')}"
+
+
+def _inline_film(frames: list[Rgb], rate: float) -> str:
+    """A moving picture that a page plays without a script."""
+    from PIL import Image
+
+    first, *others = map(Image.fromarray, frames)
+    film, shown_ms = io.BytesIO(), round(1000 / rate)
+    first.save(film, "WEBP", save_all=True, append_images=others, duration=shown_ms, loop=0, quality=QUALITY)
+    return f"data:image/webp;base64,{base64.b64encode(film.getvalue()).decode('ascii')}"
 
 
 @cache

@@ -10,8 +10,10 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
 from synth.dataset.job import DATASET_FILE
-from synth.dataset.reader import META_FILE, read_dataset, read_meta
+from synth.dataset.reader import read_dataset
 from synth.dataset.sample import further_cameras
+from synth.dataset.sample_reader import META_FILE, read_meta
+from synth.dataset.tracks import STATES
 from synth.errors import InputError
 from synth.flow.field import FlowArray
 from synth.inspect.view import View, view_flow, view_sample
@@ -89,7 +91,7 @@ def _kind_of(place: Path) -> Kind:
         return "flow"
     if (place / DATASET_FILE).exists():
         return "dataset"
-    if (place / "flow.exr").exists() or (place / "meta.json").exists():
+    if any((place / name).exists() for name in ("flow.exr", "flow", META_FILE)):
         return "sample"
     raise InputError(f"{place}: holds neither {DATASET_FILE} nor flow.exr; give {_ALLOWED}")
 
@@ -125,7 +127,8 @@ def numbers_of(view: View) -> dict[str, Any]:
     nan_share of all pixels; visible_share of those with gel), closure, sigma (median_px, p95_px, max_px, pixels),
     difference (before_rmse, after_rmse as shares of full scale over visible pixels), and from a sample's meta.json
     index, trajectory, frames, force_n, torque_nmm, solver; and of the forces the part along the inward normal of the
-    press (+z but on round gels), and the length of the rest: normal_force_n, side_force_n.
+    press (+z but on round gels), and the length of the rest: normal_force_n, side_force_n. Of a clip these are of its
+    first and its last frame, and states has the columns of states.csv.
     """
     height, width = view.size
     flow, meta = view.flow, view.meta
@@ -156,6 +159,7 @@ def numbers_of(view: View) -> dict[str, Any]:
         "difference": difference,
         "solver": diagnostics.get("solver"),
         "channels": sorted(flow.extras),
+        "states": None if view.clip is None else {name: view.clip.states[name].tolist() for name in STATES},
     }
 
 

@@ -11,7 +11,7 @@ red, down is yellow. With hue :math:`h(θ)`, :math:`θ = atan2(V, U)`, and :math
 so what is longer than the scale is dark, not lost. NaN is grey.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -42,12 +42,17 @@ class Arrows:
 
 @dataclass(frozen=True)
 class Panel:
-    """One picture, (H, W, 3) uint8: its caption with numbers, arrows, and whether the wheel explains its colours."""
+    """One picture, (H, W, 3) uint8: its caption with numbers, arrows, and whether the wheel explains its colours.
+
+    Where there is a `film`, it gives the frames of a moving picture, and `rate` says how many are shown in a second.
+    """
 
     caption: str
     picture: Rgb
     has_wheel: bool = False
     arrows: Arrows | None = None
+    film: Callable[[], list[Rgb]] | None = None
+    rate: float = 1.0
 
 
 def panels_of(view: View, numbers: Mapping[str, Any]) -> list[Panel]:

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from synth.dataset.storage import replace_file
+from synth.inspect.clips import pictures_of
 from synth.inspect.inspection import Inspection
-from synth.inspect.panels import Panel, panels_of, wheel_legend
+from synth.inspect.panels import Panel, wheel_legend
 from synth.inspect.text import facts
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ def write_sheet(inspection: Inspection, png: Path | str) -> None:
     is_dataset = inspection.kind == "dataset"
     chosen = inspection.spread(ROWS) if is_dataset else list(range(len(inspection.places)))
     views = [inspection.view(number) for number in chosen]
-    blocks = [panels_of(view, inspection.numbers[number]) for number, view in zip(chosen, views, strict=True)]
+    blocks = [pictures_of(view, inspection.numbers[number]) for number, view in zip(chosen, views, strict=True)]
     columns = max(map(len, blocks), default=0) if is_dataset else 3
     width, letters, beside = (2.75, 7.5, 0.0) if is_dataset else (4.2, 10.0, 4.0)
     caption = 0.03 * letters

@@ -119,8 +119,8 @@ COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("no gel", lambda n: percent(n["forward"]["nan_share"])),
     ("visible", lambda n: percent(n["forward"]["visible_share"])),
     ("closure\n95 %, px", lambda n: short((n["closure"] or {}).get("p95_px"))),
-    ("difference\nbefore", lambda n: percent(n["difference"]["before_rmse"])),
-    ("difference\nwarped", lambda n: percent(n["difference"]["after_rmse"])),
+    ("difference\nbefore", lambda n: percent((n["difference"] or {}).get("before_rmse"))),
+    ("difference\nwarped", lambda n: percent((n["difference"] or {}).get("after_rmse"))),
     ("con-\nverged", lambda n: short(_solver(n).get("converged"))),
 )
 """Columns of the table of samples: the heading, and the cell from a sample's numbers."""

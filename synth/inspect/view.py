@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from synth.arrays import BoolArray, FloatArray
 from synth.dataset.exr import flow_of, read_channels
 from synth.dataset.images import Raster
-from synth.dataset.reader import META_FILE, read_meta, read_pair
+from synth.dataset.sample import Layout
+from synth.dataset.sample_reader import META_FILE, ClipData, read_clip, read_meta, read_pair
 from synth.flow.field import FlowField
 
 
@@ -29,7 +30,8 @@ from synth.flow.field import FlowField
 class View:
     """One sample, or one flow file (then there are no images and `meta` is its header, else meta.json).
 
-    `visible_known` is False for a flow file that does not tell (an estimate); the name is for titles.
+    `visible_known` is False for a flow file that does not tell (an estimate); the name is for titles. A clip is seen as
+    the pair of its first and its last frame.
     """
 
     name: str
@@ -38,6 +40,7 @@ class View:
     image1: Raster | None = None
     image2: Raster | None = None
     meta: Mapping[str, Any] = field(default_factory=dict)
+    clip: ClipData | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -92,9 +95,13 @@ class View:
 def view_sample(folder: Path) -> View:
     """The view of a sample's or a further camera's folder; InputError where files are missing or damaged."""
     is_further = not (folder / META_FILE).exists() and (folder.parent / META_FILE).exists()
-    meta = read_meta(folder.parent if is_further else folder)
-    pair = read_pair(folder)
-    name = f"{folder.parent.name}/{folder.name}" if is_further else folder.name
+    home, camera = (folder.parent, folder.name) if is_further else (folder, "")
+    name, meta = f"{home.name}/{camera}" if camera else home.name, read_meta(home)
+    if (layout := Layout.of(meta["scene"])).is_of_clips:
+        clip = read_clip(home, camera)
+        last = clip.pair(0, len(clip) - 1)
+        return View(name, last.flow, True, last.image1, last.image2, last.meta, clip)
+    pair = read_pair(folder, layout)
     return View(name, pair.flow, image1=pair.image1, image2=pair.image2, meta=meta)
 
 

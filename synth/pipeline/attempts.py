@@ -11,21 +11,21 @@ from synth.dataset.manifest import Failure
 from synth.errors import InputError
 from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory, Task
 from synth.scene import Scene
-from synth.scene.sampling import MAX_DRAWS, Pair, SensorInstance, draw, pairs_of
+from synth.scene.sampling import MAX_DRAWS, SampleFrames, SensorInstance, draw, samples_of
 from synth.simulate import Trajectory
 from synth.simulate.press import Press, blunter
 
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """One instance, to be simulated: its press, and the samples (`pairs`) that are wanted of it.
+    """One instance, to be simulated: its press, and the samples that are wanted of it.
 
     `frames` are the states that any sample of the trajectory shows, wanted or not: a state's bits must not depend on
     which samples are still to be made. `again` says that the object was pressed before, by the same instance.
     """
 
     press: Press
-    pairs: tuple[Pair, ...]
+    samples: tuple[SampleFrames, ...]
     frames: frozenset[int]
     again: bool
 
@@ -37,7 +37,7 @@ class Attempts:
         """Begin with the first instance; `sensor` is that of the trajectory."""
         self.trajectory, self.wanted = task
         self._context, self._sensor, self._count = context, sensor, 0
-        self._first = self.trajectory * context.plan.template.sampling.pairs_per_trajectory
+        self._first = self.trajectory * context.plan.template.sampling.samples_per_trajectory
         self._waiting: list[Scene] = []
         self.failures: list[Failure] = []
         for reason in sensor.rejected:
@@ -66,9 +66,9 @@ class Attempts:
                 if stage == "simulate" and not retry:
                     return None
                 continue
-            every = pairs_of(plan.template, seed, self.trajectory, scene.motion.steps)
-            pairs = tuple(pair for pair in every if pair.index in self.wanted)
-            return Attempt(press, pairs, frozenset(frame for pair in every for frame in pair.frames), again)
+            every = samples_of(plan.template, seed, self.trajectory, scene.motion.steps)
+            samples = tuple(sample for sample in every if sample.index in self.wanted)
+            return Attempt(press, samples, frozenset(frame for one in every for frame in one.frames), again)
         return None
 
     def simulated(self, attempt: Attempt, result: Trajectory) -> SimulatedTrajectory | None:
@@ -79,11 +79,11 @@ class Attempts:
                 self._waiting += blunter(attempt.press)
             return None
         press, space, states = attempt.press, result.space, result.states
-        shown = sorted({frame for pair in attempt.pairs for frame in pair.frames})
+        shown = sorted({frame for sample in attempt.samples for frame in sample.frames})
         return SimulatedTrajectory(
             self.trajectory,
             press.scene,
-            attempt.pairs,
+            attempt.samples,
             {n: replace(states[n], displacement=states[n].displacement[space.surface_nodes]) for n in shown},
             {"mesh": press.mesh.hash, "element": space.element.name},
             space.surface,

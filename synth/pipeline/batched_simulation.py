@@ -29,7 +29,7 @@ CHUNK = 4
 """Batches in a chunk of tasks that are drawn together: lanes are left empty at its end alone. The first
 chunk is one batch, because nothing can be rendered before it has been drawn."""
 MIN_PER_SENSOR = 16
-"""Waiting trajectories of a sensor that are worth building its renderer for."""
+"""Waiting trajectories of a sensor that are worth building its renderer for; a clip alone is."""
 
 Result = SimulatedTrajectory | Outcome
 """A simulated trajectory, or the record of one whose every instance failed."""
@@ -121,10 +121,11 @@ def by_sensor(template: Template, ended: Iterable[tuple[int, Result]], open: Cou
     `open` says how many of each sensor are still to come; it is counted down.
     """
     waiting: dict[int, list[Result]] = {}
+    enough = 1 if template.sampling.kind == "clips" else MIN_PER_SENSOR
     for trajectory, result in ended:
         sensor = sensor_of(template, trajectory)
         open[sensor] -= 1
         mine = waiting.setdefault(sensor, [])
         mine.append(result)
-        if len(mine) >= MIN_PER_SENSOR or open[sensor] == 0:
+        if len(mine) >= enough or open[sensor] == 0:
             yield waiting.pop(sensor)

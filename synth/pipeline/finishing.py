@@ -5,27 +5,32 @@ that has the GPU.
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from synth.arrays import Image
 from synth.dataset.images import Raster
-from synth.dataset.sample import CameraPair, Sample
+from synth.dataset.sample import CameraFrames, Sample
 from synth.dataset.sample_files import write_sample_files
-from synth.flow.exact import exact_flow
+from synth.flow.exact import exact_flow, since_before
 from synth.flow.field import FlowField
+from synth.flow.markers import tracks
 from synth.flow.view import View
 from synth.optics import Optics
 from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory
 from synth.pipeline.render_session import Frame, RenderedTrajectory
 from synth.render.camera_image import camera_image
+from synth.render.chart import chart_of
 from synth.render.exposure import advice, levels_of
+from synth.render.pattern import dots_of
 from synth.render.rest_map import read_rest_map
 from synth.scene import Camera, MeshIndenter, Outputs
-from synth.scene.sampling import Pair
+from synth.scene.sampling import SampleFrames
 from synth.simulate import State
 from synth.simulate.contact_patch import ContactPatch
 from synth.simulate.press import as_pressed
@@ -42,28 +47,35 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
     sensors = simulated.scene.sensor.views
     device = "cuda" if context.plan.variant.is_on_gpu else "cpu"
     views = {name: View(rendered.surface, Optics.of(sensor), device) for name, sensor in sensors.items()}
-    count, entries, warning = len(simulated.pairs), [], ""
+    count, entries, warning = len(simulated.samples), [], ""
     shared = {"simulate": simulated.seconds / count, "render": rendered.seconds / count}
-    for pair in simulated.pairs:
-        started = time.perf_counter()
-        sample = _sample(context, rendered, pair, diagnostics, views)
-        traced = time.perf_counter()
-        if pair is simulated.pairs[0]:
-            warning = _warning(context, sample, rendered.frames[pair.frames[0]].radiance[""])
+    for shown in simulated.samples:
+        started, tracing = time.perf_counter(), list[float]()
+        sample = _sample(context, rendered, shown, diagnostics, views, tracing)
+        if shown is simulated.samples[0] and simulated.scene.outputs.images:
+            warning = _warning(context, sample, views[""], rendered.frames[shown.frames[0]])
         entry = write_sample_files(context.out, sample, context.job)
-        seconds = {**shared, "flow": traced - started, "write": time.perf_counter() - traced}
+        seconds = {**shared, "flow": sum(tracing), "write": time.perf_counter() - started - sum(tracing)}
         entries.append(replace(entry, seconds={stage: round(value, 4) for stage, value in seconds.items()}))
     return Outcome(tuple(entries), simulated.failures, (), tuple(filter(None, (simulated.warning, warning))))
 
 
-def _warning(context: JobContext, sample: Sample, radiance: Image) -> str:
+@contextmanager
+def _timed(spent: list[float]) -> Iterator[None]:
+    """Puts the seconds of a block on a list."""
+    started = time.perf_counter()
+    yield
+    spent.append(time.perf_counter() - started)
+
+
+def _warning(context: JobContext, sample: Sample, view: View, frame: Frame) -> str:
     """What makes a sample's images useless: little gel in them, or light that is clipped, dark or flat; or empty."""
-    gel = np.isfinite(sample.flow.forward[:, :, 0])
+    gel = view.image(view.state(frame.positions).hits.triangle >= 0) > 0
     if (share := gel.mean()) < LEAST_GEL:
         return f"images show gel in {100 * share:.0f} % of their pixels only: check fx, fy and place of sensor.camera"
     camera = sample.scene.sensor.camera
     rest_map = read_rest_map(camera, context.plan.template.folder)
-    found = advice(levels_of(sample.image1, gel), radiance, gel, camera, rest_map)
+    found = advice(levels_of(sample.cameras[""].images[0], gel), frame.radiance[""], gel, camera, rest_map)
     return f"light is {found} (see `python -m synth preview`)" if found else ""
 
 
@@ -80,43 +92,48 @@ def _diagnostics(context: JobContext, simulated: SimulatedTrajectory) -> dict[st
 def _sample(
     context: JobContext,
     rendered: RenderedTrajectory,
-    pair: Pair,
+    shown: SampleFrames,
     diagnostics: Mapping[str, Any],
     views: Mapping[str, View],
+    tracing: list[float],
 ) -> Sample:
-    """`views` are the trajectory's cameras by name."""
+    """`views` are the trajectory's cameras by name; the flow is traced, and timed, when it is written."""
     simulated = rendered.simulated
-    scene, path = simulated.scene, simulated.path
-    first, second = states = [simulated.states[frame] for frame in pair.frames]
-    solver, patch = [state.summary() for state in states], None
-    if scene.outputs.contact:
-        for state, frame, summary in zip(states, pair.frames, solver, strict=True):
-            patch = ContactPatch.of(simulated.faces, state.displacement, path, frame, state.max_penetration_mm)
-            summary["contact_area_mm2"] = patch.area_mm2
-    frames = [rendered.frames[frame] for frame in pair.frames]
+    scene, outputs, is_clip = simulated.scene, simulated.scene.outputs, simulated.scene.sampling.kind == "clips"
+    states = [simulated.states[frame] for frame in shown.frames]
+    solver, patches = [state.summary() for state in states], []
+    if outputs.contact or is_clip:
+        for state, number, summary in zip(states, shown.frames, solver, strict=True):
+            nodal, deepest = state.displacement, state.max_penetration_mm
+            patches.append(ContactPatch.of(simulated.faces, nodal, simulated.path, number, deepest))
+            summary["contact_area_mm2"] = patches[-1].area_mm2
+    frames = [rendered.frames[frame] for frame in shown.frames]
+    dots = dots_of(scene.sensor, context.stream("pattern", shown.sensor)) if is_clip else np.zeros((0, 2))
+    flattened = chart_of(scene.sensor).flattened(rendered.surface.material)
     cameras = {}
     for k, (name, sensor) in enumerate(scene.sensor.views.items()):
         own = (k,) if k else ()  # of each further camera's noise
-        image1, image2 = (
-            expose(context, sensor.camera, frame.radiance[name], (pair.index, number, *own))
-            for number, frame in enumerate(frames)
-        )
-        cameras[name] = CameraPair(image1, image2, _flow(scene.outputs, views[name], frames, second, patch))
-    main = cameras.pop("")
+        numbered = enumerate(frames) if outputs.images else ()
+        flows = _flows(outputs, views[name], frames, states, patches, tracing)
+        with _timed(tracing):
+            images = tuple(
+                expose(context, sensor.camera, frame.radiance[name], (shown.index, number, *own))
+                for number, frame in numbered
+            )
+            markers = tracks(views[name], flattened, dots, [frame.positions for frame in frames])
+        cameras[name] = CameraFrames((sensor.camera.height, sensor.camera.width), images, flows, markers)
     return Sample(
-        index=pair.index,
-        trajectory=pair.trajectory,
-        frames=pair.frames,
+        index=shown.index,
+        trajectory=shown.trajectory,
+        frames=shown.frames,
         seed=context.job.seed,
-        **vars(main),
-        scene=as_pressed(scene, path.body),
+        scene=as_pressed(scene, simulated.path.body),
         surface=rendered.surface,
-        displacement1=first.displacement,
-        displacement2=second.displacement,
+        displacements=tuple(state.displacement for state in states),
+        cameras=cameras,
         diagnostics={"solver": solver, **diagnostics},
-        force_n=np.array([first.force_n, second.force_n]),
-        torque_nmm=np.array([first.torque_nmm, second.torque_nmm]),
-        further=cameras,
+        force_n=np.array([state.force_n for state in states]),
+        torque_nmm=np.array([state.torque_nmm for state in states]),
     )
 
 
@@ -128,15 +145,27 @@ def expose(context: JobContext, camera: Camera, radiance: Image, numbers: tuple[
     return camera_image(radiance, camera, rng, read_rest_map(camera, context.plan.template.folder))
 
 
-def _flow(outputs: Outputs, view: View, frames: list[Frame], pressed: State, patch: ContactPatch | None) -> FlowField:
-    """The exact flow between two frames, with what else the outputs ask for; `pressed` is the second state."""
-    surface = view.surface
-    traction = surface.interpolate_linear(pressed.traction) if outputs.traction else None
-    return exact_flow(
-        view,
-        frames[0].positions,
-        frames[1].positions,
-        **outputs.model_dump(include={"backward", "depth", "normal", "displacement"}),
-        traction=traction,
-        contact=patch.holds if patch else None,
-    )
+def _flows(
+    outputs: Outputs,
+    view: View,
+    frames: Sequence[Frame],
+    states: Sequence[State],
+    patches: Sequence[ContactPatch],
+    tracing: list[float],
+) -> Iterator[FlowField]:
+    """The exact flow from the first frame to each other, with what else the outputs ask for."""
+    surface, places = view.surface, [frame.positions for frame in frames]
+    for k in range(1, len(frames)):
+        with _timed(tracing):
+            flow = exact_flow(
+                view,
+                places[0],
+                places[k],
+                **outputs.model_dump(include={"backward", "depth", "normal", "displacement"}),
+                traction=surface.interpolate_linear(states[k].traction) if outputs.traction else None,
+                contact=patches[k].holds if outputs.contact else None,
+            )
+            slip = partial(patches[k].slip, patches[k - 1]) if outputs.slip else None
+            more = since_before(view, places[0], places[k - 1], places[k], previous=outputs.previous, slip=slip)
+            flow = replace(flow, extras={**flow.extras, **more})
+        yield flow

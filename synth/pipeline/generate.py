@@ -193,7 +193,7 @@ def generate(
     _check(scheduling, out)
     planned = plan(scene, variant)
     job = make_job(planned, n, seed)
-    count = planned.template.sampling.pairs_per_trajectory
+    count = planned.template.sampling.samples_per_trajectory
     if (devices := _devices(planned, n // count, out, scheduling)) > 1:
         make = partial(_shard_on_device, planned.template, n, out, seed, planned.variant, scheduling, devices)
         summary = Summary.of_all(on_devices(make, devices, progress or (lambda done, asked_for: None)))
@@ -272,7 +272,7 @@ def _tasks(context: JobContext, writer: DatasetWriter, n: int, finished: set[int
     InputError where a mesh cannot be made or kept.
     """
     template = context.plan.template
-    count = template.sampling.pairs_per_trajectory
+    count = template.sampling.samples_per_trajectory
     meshed = None
     for trajectory in range(shard.number, (n + count - 1) // count, shard.count):
         wanted = tuple(i for i in range(trajectory * count, min(n, (trajectory + 1) * count)) if i not in finished)

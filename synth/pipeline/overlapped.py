@@ -41,11 +41,11 @@ def outcomes_of_batches(
     if workers == 1:
         yield from map(_finisher(context, RenderSession(context)), groups)
         return
-    pairs = context.plan.template.sampling.pairs_per_trajectory
+    per_trajectory = context.plan.template.sampling.samples_per_trajectory
 
     def number(group: list[Result]) -> int:
         first = group[0]
-        return first.given_up[0] // pairs if isinstance(first, Outcome) else first.number
+        return first.given_up[0] // per_trajectory if isinstance(first, Outcome) else first.number
 
     with prefetched(groups, PREFETCHED) as ready:
         yield from spread(context, _finisher_on_one_core, ready, workers, number)
@@ -74,7 +74,7 @@ def prefetched(items: Iterable[Item], limit: int) -> Iterator[Iterator[Item]]:
 
 def _finisher_on_one_core(context: JobContext) -> Maker[list[Result]]:
     """What a worker process does with a group; on a GPU kernels are compiled while the first group is simulated."""
-    render_on_one_core(context.plan.variant)
+    render_on_one_core(context.plan)
     session = RenderSession(context)
     if context.plan.variant.is_on_gpu:
         session.warm_up()

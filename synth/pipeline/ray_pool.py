@@ -125,6 +125,6 @@ _producer: tuple[str, Producer] | None = None
 def _work(context: JobContext, token: str, trajectory: int, wanted: tuple[int, ...]) -> Outcome:
     global _producer
     if _producer is None or _producer[0] != token:
-        render_on_one_core(context.plan.variant)  # Ray itself keeps linear algebra to a task's one core
+        render_on_one_core(context.plan)  # Ray itself keeps linear algebra to a task's one core
         _producer = token, Producer(context)
     return _producer[1].produce(trajectory, wanted)

@@ -13,7 +13,7 @@ from synth.dataset.manifest import Failure, ManifestEntry
 from synth.dataset.store import Output, mesh_folder
 from synth.planning import Plan
 from synth.scene import Scene
-from synth.scene.sampling import Pair, stream
+from synth.scene.sampling import SampleFrames, stream
 from synth.simulate import State
 from synth.simulate.load_path import LoadPath
 from synth.simulate.resolution import Accuracy
@@ -66,7 +66,7 @@ class SimulatedTrajectory:
 
     number: int  # of the trajectory
     scene: Scene  # fully drawn
-    pairs: tuple[Pair, ...]  # the samples that are wanted
+    samples: tuple[SampleFrames, ...]  # that are wanted
     states: dict[int, State]  # by number, those that the samples show; displacements are those of the contact face
     mesh: dict[str, Any]  # what is said of the mesh: hash and element
     faces: ContactFaces  # of the mesh
@@ -78,4 +78,4 @@ class SimulatedTrajectory:
 
     @property
     def sensor(self) -> int:
-        return self.pairs[0].sensor
+        return self.samples[0].sensor

@@ -69,15 +69,20 @@ class RenderSession:
 
     def warm_up(self) -> None:
         """Have kernels compiled, by the picture of the first sensor at rest, if its gel is flat."""
+        if not self._context.plan.template.outputs.images:
+            return
         with suppress(InputError):  # a job whose first sensor cannot be drawn or rendered says so in its turn
             scene = draw(self._context.plan.template, self._context.job.seed, 0)
             if scene.sensor.gel.is_flat:
                 self._prepared(scene, 0, rest_surface(scene.sensor.gel))
 
     def render_frames(self, simulated: SimulatedTrajectory) -> RenderedTrajectory:
-        """Render the frames of a trajectory that its wanted samples show."""
+        """Render the frames of a trajectory that its wanted samples show; without images they have no radiance."""
         started = time.perf_counter()
         surface = self._surface_of(simulated)
+        if not self._context.plan.template.outputs.images:
+            placed = {n: Frame(surface.positions(state.displacement), {}) for n, state in simulated.states.items()}
+            return RenderedTrajectory(simulated, surface, placed, time.perf_counter() - started)
         sensor = self._prepared(simulated.scene, simulated.sensor, surface)
         frames: dict[int, Frame] = {}
         for number, state in sorted(simulated.states.items()):

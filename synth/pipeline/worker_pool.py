@@ -36,7 +36,7 @@ from typing import Any, TypeAlias, TypeVar
 from synth.errors import InputError
 from synth.pipeline.producer import Producer
 from synth.pipeline.records import JobContext, Outcome, Task
-from synth.render.variant import Variant
+from synth.planning import Plan
 
 Item = TypeVar("Item")
 Maker: TypeAlias = Callable[[Item], Outcome]
@@ -188,7 +188,7 @@ def _work(item: Any) -> Outcome:
 
 
 def _trajectory_maker(context: JobContext) -> Maker[Task]:
-    render_on_one_core(context.plan.variant)
+    render_on_one_core(context.plan)
     producer = Producer(context)
     return lambda task: producer.produce(*task)
 
@@ -219,9 +219,11 @@ def one_thread_each() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def render_on_one_core(variant: Variant) -> None:
+def render_on_one_core(plan: Plan) -> None:
     """Have this process, a worker, render with one thread; Mitsuba's scalar code has its threads from Dr.Jit, too."""
-    variant.load()
+    if not plan.template.outputs.images:
+        return
+    plan.variant.load()
     import drjit
 
     drjit.set_thread_count(1)

@@ -9,10 +9,10 @@ from synth.errors import InputError
 from synth.mesh import default_edge_length, face_of
 from synth.mesh.cad import CadFace
 from synth.render.camera_rays import pinhole
+from synth.render.coating import is_separated
 from synth.render.measured_light import read_measured_light
 from synth.render.pattern import check_pattern, is_grey
 from synth.render.rest_map import read_rest_map
-from synth.render.separated_light import is_separated
 from synth.render.thin_lens import check_views
 from synth.render.variant import Variant, job_variant
 from synth.scene import MeshIndenter
@@ -138,10 +138,12 @@ def _decisions(template: Template, variant: Variant) -> tuple[Decision, ...]:
     )
     if grey and not variant.is_mono:
         hue += f", but {variant.name} has no grey counterpart here"
-    optional = [name for name in ("depth", "normal", "displacement", "traction", "contact") if getattr(outputs, name)]
+    names = ("depth", "normal", "displacement", "traction", "contact", "slip", "previous")
+    optional = [name for name in names if getattr(outputs, name)]
     foam = "" if mixed else ": a compressible foam needs none"
     smooth = "" if max(friction) > 0 else ": half the matrix is enough"
     return (
+        Decision("pictures", outputs.images, f"outputs.images = {str(outputs.images).lower()}"),
         Decision("simulation", max(depth) > 0, _span("motion.depth_mm", depth)),
         Decision("friction state", max(friction) > 0, _span("contact.friction", friction) + smooth),
         Decision("pressure field", mixed, _span("sensor.gel.poisson_ratio", poisson) + foam),

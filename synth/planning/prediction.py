@@ -53,6 +53,8 @@ SECONDS_PER_MILLION_SAMPLES = {"llvm": 0.4, "scalar": 1.0, "cuda": 0.002}
 FLOW_SECONDS_PER_MEGAPIXEL = 1.0
 BYTES_PER_PIXEL_OF_FLOW = 14.0
 BYTES_PER_PIXEL_OF_IMAGE = 1.4
+MEMORY_PER_FRAME = 12.0
+"""Bytes a pixel of the radiance of each further frame of a clip."""
 MEMORY, MEMORY_PER_SAMPLE, SAMPLES_AT_ONCE, MEMORY_PER_PIXEL, MEMORY_PER_NODE = 4e8, 70, 2**22, 290, 12e3
 """Bytes of a process that simulates and renders on a CPU; samples count up to those that are traced at once."""
 
@@ -68,8 +70,8 @@ class Prediction:
             mesh is given by an edge length, for which nothing is predicted.
         target_error_px: what was asked for; None with an edge length.
         nodes: displacement nodes, mean of the trajectories.
-        seconds_per_pair: by stage, on one core.
-        bytes_per_pair: size on disk.
+        seconds_per_pair: by stage, on one core; of a clip where samples are clips.
+        bytes_per_pair: size on disk; the same.
         memory_bytes: most memory of a process that simulates and renders on a CPU.
     """
 
@@ -85,18 +87,24 @@ class Prediction:
 
 def predict(plan: Plan) -> Prediction:
     """Choose the meshes of the first trajectories as `generate` will; InputError if none can be drawn and meshed."""
-    template, variant, pairs = plan.template, plan.variant, plan.template.sampling.pairs_per_trajectory
-    corner = template.corners[0]
+    template, variant, outputs = plan.template, plan.variant, plan.template.outputs
+    sampling, corner = template.sampling, template.corners[0]
+    samples = sampling.samples_per_trajectory
+    steps = float(np.mean([one.motion.steps for one in template.corners]))
+    images, flows = (steps + 1, steps) if sampling.kind == "clips" else (2.0, 1.0)
+    rendered = (steps if sampling.kind == "clips" else 1 + 1 / samples) if outputs.images else 0.0
     cameras = [view.camera for view in corner.sensor.views.values()]
     presses, resolution, error_px = _tetwild_meshes(plan) if plan.mesh.kind == "tetwild" else _meshes(plan)
     simulate = float(np.mean([_simulation_seconds(scene, nodes, plan) for scene, nodes in presses]))
     pixels = sum(camera.width * camera.height for camera in cameras)
-    samples = AUTO_SAMPLES if corner.render.samples_per_pixel == "auto" else corner.render.samples_per_pixel
-    frame = pixels * samples / 1e6 * SECONDS_PER_MILLION_SAMPLES[variant.name.split("_")[0]]
+    rays = AUTO_SAMPLES if corner.render.samples_per_pixel == "auto" else corner.render.samples_per_pixel
+    frame = pixels * rays / 1e6 * SECONDS_PER_MILLION_SAMPLES[variant.name.split("_")[0]]
     nodes = float(np.mean([count for _, count in presses]))
-    memory = MEMORY + MEMORY_PER_PIXEL * pixels + MEMORY_PER_NODE * nodes
-    memory += MEMORY_PER_SAMPLE * min(SAMPLES_AT_ONCE, samples * max(one.width * one.height for one in cameras))
-    directions = 2 if plan.template.outputs.backward else 1
+    memory = MEMORY + (MEMORY_PER_PIXEL + MEMORY_PER_FRAME * (images - 2)) * pixels + MEMORY_PER_NODE * nodes
+    memory += MEMORY_PER_SAMPLE * min(SAMPLES_AT_ONCE, rays * max(one.width * one.height for one in cameras))
+    directions = 1 + outputs.backward + outputs.previous
+    flow_bytes = flows * BYTES_PER_PIXEL_OF_FLOW * directions / 2
+    image_bytes = images * BYTES_PER_PIXEL_OF_IMAGE if outputs.images else 0.0
     return Prediction(
         resolution=resolution,
         warning=_lost_detail(plan),
@@ -104,11 +112,11 @@ def predict(plan: Plan) -> Prediction:
         target_error_px=None if error_px is None else plan.mesh.target_error_px,
         nodes=round(nodes),
         seconds_per_pair={
-            "simulate": round(simulate / pairs, 3),
-            "render": round(frame * (1 + 1 / pairs), 3),
-            "flow": round(directions * pixels / 1e6 * FLOW_SECONDS_PER_MEGAPIXEL, 3),
+            "simulate": round(simulate / samples, 3),
+            "render": round(frame * rendered, 3),
+            "flow": round(flows * directions * pixels / 1e6 * FLOW_SECONDS_PER_MEGAPIXEL, 3),
         },
-        bytes_per_pair=round(pixels * (BYTES_PER_PIXEL_OF_FLOW * directions / 2 + 2 * BYTES_PER_PIXEL_OF_IMAGE)),
+        bytes_per_pair=round(pixels * (flow_bytes + image_bytes)),
         memory_bytes=round(memory),
     )
 

@@ -6,6 +6,7 @@ Marks above it are Lambertian. Where they cover a share m of the surface,
     f = (1 - m) · f_coating + m · f_mark,
 
 which is exact for opaque marks without thickness: m is 0 or 1 but at their edges, where it is an average over area.
+Light on a matt coating does not depend on the view and can be separated (`synth.render.separated_light`).
 """
 
 from typing import Any
@@ -13,7 +14,9 @@ from typing import Any
 import numpy as np
 
 from synth.arrays import Image
-from synth.scene import Coating
+from synth.errors import InputError
+from synth.render.variant import LLVM_HINT, Variant
+from synth.scene import Coating, Render, Sensor
 
 
 def reflection(mi: Any, coating: Coating, texture: Image, is_mono: bool) -> Any:
@@ -51,3 +54,25 @@ def _map(mi: Any, values: Image) -> dict[str, Any]:
     values = np.ascontiguousarray(values)
     given = {"data": mi.TensorXf(values)} if dr.is_jit_v(mi.Float) else {"bitmap": mi.Bitmap(values)}
     return {"type": "bitmap", **given, "raw": True, "wrap_mode": "clamp"}
+
+
+def is_separated(render: Render, sensor: Sensor, variant: Variant) -> bool:
+    """Whether light is separated or path traced: decided here alone. Scalar variants path-trace.
+
+    InputError where separated light is asked for, and the coating shines, and for measured light without it.
+    """
+    coating = sensor.coating
+    if sensor.measured_light is not None and not (render.light == "separated" and variant.is_vectorised):
+        raise InputError(
+            f'sensor.measured_light needs render.light = "separated" (given: "{render.light}") and a vectorised '
+            f"variant (here: {variant.name}): {LLVM_HINT}"
+        )
+    if render.light != "separated":
+        return False
+    if not coating.is_matt:
+        raise InputError(
+            f'render.light = "separated" needs a matt coating (roughness = 1, metallic = 0), but this sensor\'s has '
+            f"roughness = {coating.roughness:g} and metallic = {coating.metallic:g}: what shines depends on the view; "
+            'set render.light to "path_traced"'
+        )
+    return variant.is_vectorised

@@ -5,6 +5,7 @@ lie as `synth.render.chart.RoundChart` says; there marks have their true sizes o
 """
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -35,6 +36,25 @@ def _dots(pattern: Dots, x: FloatArray, y: FloatArray, rng: np.random.Generator)
     """Dots on a jittered grid; the share falls from 1 to 0 over `softness_mm` around their edges."""
     softness = max(pattern.softness_mm, x[1] - x[0], y[1] - y[0])
     coverage = np.zeros((len(y), len(x)))
+    c, s = math.cos(math.radians(pattern.rotation_deg)), math.sin(math.radians(pattern.rotation_deg))
+    for cx, cy, radius in _grid(pattern, x, y, rng):
+        reach = radius + softness
+        rows = slice(*np.searchsorted(y, [cy - reach, cy + reach]))
+        columns = slice(*np.searchsorted(x, [cx - reach, cx + reach]))
+        right, down = x[None, columns] - cx, y[rows, None] - cy
+        if pattern.shape == "round":
+            inside = radius - np.hypot(right, down)
+        else:
+            inside = (radius - np.abs(right * c + down * s) - np.abs(down * c - right * s)) / math.sqrt(2)
+        dot = np.clip(inside / softness + 0.5, 0, 1)
+        coverage[rows, columns] = np.maximum(coverage[rows, columns], dot)
+    return coverage
+
+
+def _grid(
+    pattern: Dots, x: FloatArray, y: FloatArray, rng: np.random.Generator
+) -> Iterator[tuple[float, float, float]]:
+    """Centres x, y and radii, mm, of the dots of a jittered grid."""
     (sx, sy), (ox, oy) = pattern.spacing_mm, pattern.offset_mm
     c, s = math.cos(math.radians(pattern.rotation_deg)), math.sin(math.radians(pattern.rotation_deg))
     corners = [(u - ox, v - oy) for u in (x[0], x[-1]) for v in (y[0], y[-1])]
@@ -44,18 +64,16 @@ def _dots(pattern: Dots, x: FloatArray, y: FloatArray, rng: np.random.Generator)
             dx, dy, grow = rng.standard_normal(3)
             cx = ox + i * sx * c - j * sy * s + pattern.jitter_mm * dx
             cy = oy + i * sx * s + j * sy * c + pattern.jitter_mm * dy
-            radius = pattern.radius_mm * max(0.0, 1 + pattern.radius_jitter * grow)
-            reach = radius + softness
-            rows = slice(*np.searchsorted(y, [cy - reach, cy + reach]))
-            columns = slice(*np.searchsorted(x, [cx - reach, cx + reach]))
-            right, down = x[None, columns] - cx, y[rows, None] - cy
-            if pattern.shape == "round":
-                inside = radius - np.hypot(right, down)
-            else:
-                inside = (radius - np.abs(right * c + down * s) - np.abs(down * c - right * s)) / math.sqrt(2)
-            dot = np.clip(inside / softness + 0.5, 0, 1)
-            coverage[rows, columns] = np.maximum(coverage[rows, columns], dot)
-    return coverage
+            yield cx, cy, pattern.radius_mm * max(0.0, 1 + pattern.radius_jitter * grow)
+
+
+def dot_centres(pattern: Dots, chart: Chart, x: FloatArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Places (n, 2) mm in the texture of the centres of all dots that have a size; arguments as of `marks_coverage`."""
+    if isinstance(chart, RoundChart):
+        dots = [(s * math.cos(a), s * math.sin(a), radius) for s, a, radius in _meridians(pattern, chart, rng)]
+    else:
+        dots = list(_grid(pattern, x, y, rng))
+    return np.array([dot[:2] for dot in dots if dot[2] > 0]).reshape(-1, 2)
 
 
 def _speckle(pattern: Speckle, x: FloatArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -80,6 +98,26 @@ def _round_dots(pattern: Dots, chart: RoundChart, x: FloatArray, y: FloatArray, 
     """Dots along meridians; where they would be less than their size apart, half as many, evenly spread."""
     softness = max(pattern.softness_mm, x[1] - x[0], y[1] - y[0])
     coverage = np.zeros((len(y), len(x)))
+    for place, angle, radius in _meridians(pattern, chart, rng):
+        far = place + radius + softness
+        reach = (radius + softness) * max(1.0, far / float(chart.across(far)))
+        cx, cy = place * math.cos(angle), place * math.sin(angle)
+        rows = slice(*np.searchsorted(y, [cy - reach, cy + reach]))
+        columns = slice(*np.searchsorted(x, [cx - reach, cx + reach]))
+        u, v = np.meshgrid(x[columns], y[rows])
+        arm = chart.points(np.hypot(u, v), np.arctan2(v, u)) - chart.points(np.array(place), np.array(angle))
+        away = np.linalg.norm(arm, axis=-1)
+        if pattern.shape == "diamond":
+            aside_mm = np.abs(arm @ (-math.sin(angle), math.cos(angle), 0.0))
+            away = (aside_mm + np.sqrt(np.maximum(away**2 - aside_mm**2, 0))) / math.sqrt(2)
+            radius /= math.sqrt(2)
+        dot = np.clip((radius - away) / softness + 0.5, 0, 1)
+        coverage[rows, columns] = np.maximum(coverage[rows, columns], dot)
+    return coverage
+
+
+def _meridians(pattern: Dots, chart: RoundChart, rng: np.random.Generator) -> Iterator[tuple[float, float, float]]:
+    """Arcs mm from the tip, azimuths and radii mm of the dots of a round face."""
     (across_mm, along_mm), (turned, first) = pattern.spacing_mm, pattern.offset_mm
     meridians = max(1, round(2 * math.pi * chart.radius / across_mm))
     if pattern.placing == "spherical":
@@ -93,22 +131,7 @@ def _round_dots(pattern: Dots, chart: RoundChart, x: FloatArray, y: FloatArray, 
             shift, aside, grow = rng.standard_normal(3)
             place = max(0.0, arc + pattern.jitter_mm * shift)
             angle = azimuth + pattern.jitter_mm * aside / max(float(chart.across(place)), pattern.radius_mm)
-            radius = pattern.radius_mm * max(0.0, 1 + pattern.radius_jitter * grow)
-            far = place + radius + softness
-            reach = (radius + softness) * max(1.0, far / float(chart.across(far)))
-            cx, cy = place * math.cos(angle), place * math.sin(angle)
-            rows = slice(*np.searchsorted(y, [cy - reach, cy + reach]))
-            columns = slice(*np.searchsorted(x, [cx - reach, cx + reach]))
-            u, v = np.meshgrid(x[columns], y[rows])
-            arm = chart.points(np.hypot(u, v), np.arctan2(v, u)) - chart.points(np.array(place), np.array(angle))
-            away = np.linalg.norm(arm, axis=-1)
-            if pattern.shape == "diamond":
-                aside_mm = np.abs(arm @ (-math.sin(angle), math.cos(angle), 0.0))
-                away = (aside_mm + np.sqrt(np.maximum(away**2 - aside_mm**2, 0))) / math.sqrt(2)
-                radius /= math.sqrt(2)
-            dot = np.clip((radius - away) / softness + 0.5, 0, 1)
-            coverage[rows, columns] = np.maximum(coverage[rows, columns], dot)
-    return coverage
+            yield place, angle, pattern.radius_mm * max(0.0, 1 + pattern.radius_jitter * grow)
 
 
 def _round_speckle(

@@ -63,7 +63,7 @@ class PathTracer:
         narrowness = [light.narrowness for light in lights]
         self._narrowness = mi.Float(narrowness) if any(narrowness) else None
 
-    def radiance(self, ray: Any, sampler: Any, active: Any, prepared: None = None) -> tuple[Any, Any]:
+    def radiance(self, ray: Any, sampler: Any, active: Any, *_: Any) -> tuple[Any, Any]:
         """Radiance (mi.Spectrum) along rays from the camera, and whether they meet the gel (mi.Bool)."""
         mi, dr = self._mi, self._dr
         share, total, depth, density = mi.Spectrum(1), mi.Spectrum(0), mi.UInt32(0), mi.Float(0)

@@ -22,7 +22,7 @@ from synth.mesh.cad import CadFace
 from synth.optics import Optics
 from synth.render.bitmap import painted, read_picture
 from synth.render.chart import RoundChart, chart_of
-from synth.render.marks import marks_coverage
+from synth.render.marks import dot_centres, marks_coverage
 from synth.scene import Bitmap, Dots, NoPattern, RandomColor, Sensor, Speckle
 
 TEXELS_PER_PIXEL = 4
@@ -59,6 +59,13 @@ def albedo(sensor: Sensor, rng: np.random.Generator, folder: Path | None = None)
         whole = np.broadcast_to(colors, (*coverage.shape, 3))
         return np.concatenate([_clipped(whole), _clipped(coverage)[:, :, None]], axis=2)
     return _blended(coating, colors, coverage)
+
+
+def dots_of(sensor: Sensor, rng: np.random.Generator) -> FloatArray:
+    """Places (n, 2) mm in the texture of the dots that `albedo` paints with the same `rng`; none of other patterns."""
+    if not isinstance(sensor.pattern, Dots):
+        return np.zeros((0, 2))
+    return dot_centres(sensor.pattern, chart_of(sensor), *_texels(sensor), rng)
 
 
 def _clipped(values: FloatArray) -> Image:

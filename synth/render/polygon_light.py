@@ -11,12 +11,14 @@ first quotient is smooth in 1 - cos(θ/2) up to θ = π and is taken from a poly
 The rectangles are those of `synth.render.lights`, in the renderer's frame, and shine to their front only.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
+from numpy.polynomial.legendre import leggauss
 
 from synth.render.aligned import aligned
 from synth.render.lights import rectangles, reflectance
@@ -26,8 +28,8 @@ _DEGREE = 9
 """Degree of the polynomial, which errs by 2e-8, less than float32's rounding."""
 _LEAST = 1e-6
 """Least cosine at a light that is raised to a power: 0 to the power 0, of a Lambertian light seen edge-on, is NaN."""
-_STRATA = 2
-"""Points of a light without closed form for each of a pixel's samples, spread along its first side."""
+_ACROSS = 0.5 / math.sqrt(3)
+"""Distance of points from a light's middle line, in its width: of Gauss and Legendre's rule with two points."""
 
 
 @dataclass(eq=False)
@@ -41,77 +43,81 @@ class PolygonLight:
     area: Any
     radiance: list[Any]
 
-    def whole(self, point: Any, normal: Any, offset: Any) -> Any:
-        """Irradiance per radiance (mi.Float) of surface points with unit normals where nothing stands in between.
+    def whole(self, point: Any, normal: Any, nodes: int) -> Any:
+        """Vector irradiance per radiance (mi.Vector3f) of surface points with unit normals, nothing standing between.
 
-        `offset` (mi.Point2f in [0, 1)²) is for lights without a closed form.
+        A light without a closed form is integrated by Gauss and Legendre's rule with that many nodes along its first
+        side, on either side of its middle in turn. The vector's product with the normal is the irradiance; with others,
+        too, as long as they see as much of the light.
         """
         import drjit as dr
 
         (first, second), corner = self.sides, self.corner
         corners = [corner, corner + first, corner + first + second, corner + second]
-        rays = [dr.normalize(corner - point) for corner in corners]
+        rays = [dr.normalize(self.mi.Vector3f(corner - point)) for corner in corners]
         heights = [dr.dot(ray, normal) for ray in rays]
         lowest = dr.minimum(dr.minimum(heights[0], heights[1]), dr.minimum(heights[2], heights[3]))
-        value = dr.if_stmt((rays, heights, normal), lowest >= 0, self._risen, self._cut)
+        value = dr.if_stmt((rays, heights), lowest >= 0, self._risen, self._cut)
+        value = 0.5 * dr.mulsign(value, dr.dot(value, normal))  # whichever way round the corners are seen
         return dr.select(dr.dot(point - self.corner, self.front) > 0, value, 0)
 
-    def sample(self, point: Any, normal: Any, offset: Any) -> tuple[Any, Any]:
-        """A point of the light, and the irradiance per radiance as if all of it stood there, whose mean is `whole`.
+    def sample(self, point: Any, offset: Any) -> tuple[Any, Any]:
+        """A point of the light, and the vector irradiance per radiance as if all of it stood there.
 
-        The surface's point is a mi.Point3f with the unit normal mi.Vector3f; `offset` is a mi.Point2f in [0, 1)².
+        `whole` is its mean over points that the surface sees. The surface's point is a mi.Point3f; `offset` is a
+        mi.Point2f in [0, 1)².
         """
         import drjit as dr
 
         place = self.corner + self.sides[0] * offset.x + self.sides[1] * offset.y
-        arm = place - point
+        arm = self.mi.Vector3f(place - point)
         square = dr.squared_norm(arm)
-        cosines = dr.maximum(dr.dot(arm, normal), 0) * dr.maximum(-dr.dot(arm, self.front), 0)
-        return self.mi.Point3f(place), cosines * self.area / dr.square(square)
+        return self.mi.Point3f(place), arm * (dr.maximum(-dr.dot(arm, self.front), 0) * self.area / dr.square(square))
 
-    def _risen(self, rays: list[Any], heights: list[Any], normal: Any) -> Any:
-        import drjit as dr
+    def _risen(self, rays: list[Any], heights: list[Any]) -> Any:
+        return sum((_edge(rays[i], rays[(i + 1) % 4]) for i in range(4)), self.mi.Vector3f(0))
 
-        return 0.5 * dr.abs(sum(_edge(rays[i], rays[(i + 1) % 4], normal) for i in range(4)))
-
-    def _cut(self, rays: list[Any], heights: list[Any], normal: Any) -> Any:
+    def _cut(self, rays: list[Any], heights: list[Any]) -> Any:
         """As `_risen`, cut at the horizon: one edge more, from where the outline sets to where it rises."""
         import drjit as dr
 
         mi = self.mi
-        total, setting, rising = mi.Float(0), mi.Vector3f(0), mi.Vector3f(0)
+        total, setting, rising = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)
         for i in range(4):
             (a, b), (high, low) = ((values[i], values[(i + 1) % 4]) for values in (rays, heights))
             sets, rises = (high > 0) & (low <= 0), (high <= 0) & (low > 0)
             at = dr.normalize(a + (b - a) * (high / (high - low)))
-            part = _edge(dr.select(rises, at, a), dr.select(sets, at, b), normal)
+            part = _edge(dr.select(rises, at, a), dr.select(sets, at, b))
             total += dr.select((high > 0) | (low > 0), part, 0)
             setting, rising = dr.select(sets, at, setting), dr.select(rises, at, rising)
-        total += dr.select(dr.squared_norm(setting) > 0, _edge(setting, rising, normal), 0)
-        return 0.5 * dr.abs(total)
+        total += dr.select(dr.squared_norm(setting) > 0, _edge(setting, rising), 0)
+        return total
 
 
 @dataclass(eq=False)
 class SampledLight(PolygonLight):
     """A light without a closed form: narrower than Lambertian, or a mirror image (`synth.render.lights`).
 
-    What of an image arrives depends on the angle at the face of a window of this index. `whole` is the mean over a few
-    points.
+    What of an image arrives depends on the angle at the face of a window of this index.
     """
 
     narrowness: Any | None
     index: Any | None
 
-    def whole(self, point: Any, normal: Any, offset: Any) -> Any:
-        parts = [
-            self.sample(point, normal, self.mi.Point2f((offset.x + k) / _STRATA, offset.y))[1] for k in range(_STRATA)
-        ]
-        return sum(parts) / _STRATA
-
-    def sample(self, point: Any, normal: Any, offset: Any) -> tuple[Any, Any]:
+    def whole(self, point: Any, normal: Any, nodes: int) -> Any:
         import drjit as dr
 
-        place, value = super().sample(point, normal, offset)
+        total = self.mi.Vector3f(0)
+        for k, (along, weight) in enumerate(zip(*leggauss(nodes), strict=True)):
+            place = self.mi.Point2f(0.5 + 0.5 * float(along), 0.5 + (-1) ** k * _ACROSS)
+            value = self.sample(point, place)[1]
+            total += dr.select(dr.dot(value, normal) > 0, 0.5 * float(weight) * value, 0)
+        return total
+
+    def sample(self, point: Any, offset: Any) -> tuple[Any, Any]:
+        import drjit as dr
+
+        place, value = super().sample(point, offset)
         away = dr.normalize(place - point)
         if self.narrowness is not None:
             value *= dr.power(dr.maximum(-dr.dot(away, self.front), _LEAST), self.narrowness)
@@ -177,15 +183,15 @@ def _floats(values: Any, mi: Any) -> Any:
     return found
 
 
-def _edge(a: Any, b: Any, normal: Any) -> Any:
-    """θ n · (a × b) / |a × b| of unit vectors."""
+def _edge(a: Any, b: Any) -> Any:
+    """θ (a × b) / |a × b| of unit vectors."""
     import drjit as dr
 
     half = dr.sqrt(dr.maximum(0.5 + 0.5 * dr.dot(a, b), 1e-12))  # cos(θ/2)
     quotient = type(half)(0)
     for coefficient in reversed(_SERIES):
         quotient = dr.fma(quotient, 1 - half, coefficient)
-    return quotient / half * dr.dot(dr.cross(a, b), normal)
+    return quotient / half * dr.cross(a, b)
 
 
 def _series() -> list[float]:

@@ -21,7 +21,7 @@ from synth.render.albedo_map import AlbedoMap
 from synth.render.camera_image import PILOT, needed_samples
 from synth.render.camera_rays import CameraRays, pinhole
 from synth.render.chart import Chart, chart_of
-from synth.render.coating import reflection
+from synth.render.coating import is_separated, reflection
 from synth.render.gel_hits import GelHits
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import all_lights, emitters, panel_corners, panels, reflecting_plane
@@ -29,7 +29,7 @@ from synth.render.measured_light import LightModel
 from synth.render.path_tracer import PathTracer
 from synth.render.pattern import is_grey
 from synth.render.recordings import Recordings
-from synth.render.separated_light import SeparatedLight, is_separated
+from synth.render.separated_light import SeparatedLight
 from synth.render.smooth_light import FrameGeometry
 from synth.render.thin_lens import check_views
 from synth.render.variant import Variant
@@ -272,7 +272,7 @@ def traced(
     offset = sampler.next_2d()
     pupil = sampler.next_2d() if rays.has_aperture else None
     ray, weight, valid = rays.sample(pixel, offset, pupil)
-    color, seen = light.radiance(ray, sampler, valid, prepared)
+    color, seen = light.radiance(ray, sampler, valid, prepared, samples)
     channels = [dr.select(valid & seen, color[i] * weight, 0) for i in range(1 if is_mono else 3)]
     dr.eval(channels)  # all at once: each sum alone would trace everything anew
     return [dr.block_sum(channel, samples) for channel in channels]

@@ -4,8 +4,9 @@ A Lambertian surface's radiance is its albedo ρ times its irradiance E over π,
 
 .. math::  E = \sum_l (E_l - B_l) + E_{bounced} + E_{returned} .
 
-- ρ is looked up, and the direct light E_l of light l is computed in closed form (`synth.render.polygon_light`), at
-  every sample of every pixel: neither has any noise but the pixel filter's.
+- ρ is looked up at every sample of every pixel. The direct light E_l = n · V_l of light l is computed without noise
+  (`synth.render.polygon_light`): the vector V_l once a pixel, where its samples meet the gel in the mean, the product
+  with the normal n at every sample.
 - B_l, what of it the gel or another light blocks, is sampled: one shadow ray for each light and sample. It is a
   control variate: nothing blocked, no noise, and the expectation is path tracing's.
 - From faces of which all pilot rays reached a light, and from their neighbours, no shadow ray is traced to it. Pilots
@@ -14,7 +15,7 @@ A Lambertian surface's radiance is its albedo ρ times its irradiance E over π,
   faces and projected (L²) onto functions that are linear on each face, or constant where few of the face's pilots saw
   gel: such faces get little, and its mean is less noisy than its slope. A plane has none.
   In a round gel, all of which sees itself, it is smooth and is fitted (`synth.render.smooth_light`).
-- The lights l include their mirror images behind the window (`synth.render.lights`), which have no closed form.
+- The lights l include their mirror images behind the window (`synth.render.lights`).
 - E_returned, light that the gel sends to the window and gets back, is smooth and fitted as well.
 
 Measured light (`synth.render.measured_light`) replaces E_l where the sampled point of light l is not blocked. It was
@@ -33,7 +34,6 @@ from functools import reduce
 from operator import or_
 from typing import Any
 
-from synth.errors import InputError
 from synth.render.albedo_map import AlbedoMap
 from synth.render.face_points import FacePoints, count_per_face, projected
 from synth.render.gel_hits import GelHits
@@ -41,8 +41,7 @@ from synth.render.lights import image_lights, reaches, reflectance
 from synth.render.measured_light import LightModel, MeasuredLight
 from synth.render.polygon_light import LightTable, PolygonLight
 from synth.render.smooth_light import fitted
-from synth.render.variant import LLVM_HINT, Variant
-from synth.scene import Light, Render, Sensor
+from synth.scene import Light, Sensor
 
 _PILOTS = 2**14
 """Rays to each light, and to the gel, from a gel of few faces; 16 from each face where there are many."""
@@ -52,32 +51,12 @@ _RETURNING_PATHS = 144
 """Paths from each point at which light that comes back from the window is sampled."""
 _NEGLIGIBLE = 1e-4
 """Share of all light on a point up to which a light's shadows are not sampled."""
+_NODES, _BOUNCED_NODES = 14, 6
+"""Points of a light without closed form for a pixel, and for a point on which bounced light begins."""
 _BITS = 32
 """Lights in a word of a face's mask."""
 _SHIFT = (0.7548776662466927, 0.5698402909980532)
 """Shift of shadow rays from one light to the next: R2 sequence (Roberts 2018), on a torus to keep the strata."""
-
-
-def is_separated(render: Render, sensor: Sensor, variant: Variant) -> bool:
-    """Whether light is separated or path traced: decided here alone. Scalar variants path-trace.
-
-    InputError where separated light is asked for, and the coating shines, and for measured light without it.
-    """
-    coating = sensor.coating
-    if sensor.measured_light is not None and not (render.light == "separated" and variant.is_vectorised):
-        raise InputError(
-            f'sensor.measured_light needs render.light = "separated" (given: "{render.light}") and a vectorised '
-            f"variant (here: {variant.name}): {LLVM_HINT}"
-        )
-    if render.light != "separated":
-        return False
-    if not coating.is_matt:
-        raise InputError(
-            f'render.light = "separated" needs a matt coating (roughness = 1, metallic = 0), but this sensor\'s has '
-            f"roughness = {coating.roughness:g} and metallic = {coating.metallic:g}: what shines depends on the view; "
-            'set render.light to "path_traced"'
-        )
-    return variant.is_vectorised
 
 
 @dataclass(init=False, eq=False)
@@ -175,16 +154,29 @@ class SeparatedLight:
         return shaded, indirect
 
     def radiance(
-        self, ray: Any, sampler: Any, active: Any, prepared: tuple[list[Any], list[list[Any]]]
+        self, ray: Any, sampler: Any, active: Any, prepared: tuple[list[Any], list[list[Any]]], samples: int
     ) -> tuple[list[Any], Any]:
-        """Radiance (channels of mi.Float) along rays from the camera, and whether they meet the gel (mi.Bool)."""
+        """Radiance (channels of mi.Float) along rays from the camera, and whether they meet the gel (mi.Bool).
+
+        `samples` successive rays belong to one pixel.
+        """
         mi, dr = self._mi, self._dr
         shaded, indirect = prepared
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
         seen, _ = self._gel.kinds(hit, active)
         at = self._gel.point(ray, hit, False, seen)
         normal = dr.mulsign(mi.Vector3f(at.sh_frame.n), at.wi.z)  # the coating reflects on either side
-        light = self._direct(at, normal, hit.prim_index, sampler.next_2d(), shaded, seen)
+        light = [mi.Float(0) for _ in range(self._channels)]
+        if self._measured is None:
+            dr.eval(at.p, at.n, at.uv, normal, seen, hit.prim_index, hit.prim_uv)
+            count = dr.maximum(dr.block_sum(dr.select(seen, mi.Float(1), 0), samples), 1)
+            place, facing = (
+                mi.Vector3f([dr.block_sum(dr.select(seen, x, 0), samples) for x in of]) for of in (at.p, normal)
+            )
+            vectors = self._whole(place / count, dr.normalize(facing), _NODES)
+            dr.eval(vectors)
+            light = [dr.dot(normal, dr.repeat(vector, samples)) for vector in vectors]
+        light = self._less_blocked(light, at, normal, hit.prim_index, sampler.next_2d(), shaded, seen)
         weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
         for channel, values in enumerate(indirect):
             for value, weight in zip(values, weights, strict=True):
@@ -202,8 +194,25 @@ class SeparatedLight:
         dr.eval(smooth)
         return [[dr.gather(mi.Float, channel, corner) for corner in gel.corners] for channel in smooth]
 
-    def _direct(self, at: Any, normal: Any, face: Any, offset: Any, shaded: list[Any], active: Any) -> list[Any]:
+    def _direct(self, at: Any, normal: Any, face: Any, offset: Any, shaded: list[Any]) -> list[Any]:
         """Irradiance (channels) of points on faces, by all lights, less what is blocked."""
+        mi, dr = self._mi, self._dr
+        light = [dr.dot(vector, normal) for vector in self._whole(at.p, normal, _BOUNCED_NODES)]
+        return self._less_blocked(light, at, normal, face, offset, shaded, mi.Bool(True))
+
+    def _whole(self, point: Any, normal: Any, nodes: int) -> list[Any]:
+        """Vector irradiance (channels of mi.Vector3f) of points by all lights, nothing standing between."""
+
+        def add(light: PolygonLight, number: Any, *total: Any) -> list[Any]:
+            value = light.whole(point, normal, nodes)
+            return [value * color + sum_ for color, sum_ in zip(light.radiance, total, strict=True)]
+
+        return self._over_lights(add, [self._mi.Vector3f(0) for _ in range(self._channels)])
+
+    def _less_blocked(
+        self, light: list[Any], at: Any, normal: Any, face: Any, offset: Any, shaded: list[Any], active: Any
+    ) -> list[Any]:
+        """Irradiance (channels) of points on faces less what is blocked of it; measured light where nothing is."""
         mi, dr = self._mi, self._dr
         masks = [dr.gather(mi.UInt32, mask, face, active) for mask in shaded]
 
@@ -214,12 +223,12 @@ class SeparatedLight:
             asked = active & (((mask >> (number % _BITS)) & 1) != 0)
             blocked = self._blocked(light, number, at, normal, offset, asked)
             if self._measured is None:
-                value, given = light.whole(at.p, normal, offset) - blocked, light.radiance
+                value, given = -blocked, light.radiance
             else:
                 value, given = dr.select(blocked > 0, 0, 1), self._measured.irradiance(number, at, normal, active)
             return [dr.fma(value, color, sum_) for color, sum_ in zip(given, total, strict=True)]
 
-        return self._over_lights(add, [mi.Float(0) for _ in range(self._channels)])
+        return self._over_lights(add, light)
 
     def _over_lights(self, add: Callable[..., list[Any]], sums: list[Any]) -> list[Any]:
         """Sums after `add`, called with each light, its number (mi.UInt32) and the sums so far."""
@@ -255,7 +264,8 @@ class SeparatedLight:
     def _point(self, light: PolygonLight, number: Any, at: Any, normal: Any, offset: Any) -> Any:
         mi, dr = self._mi, self._dr
         moved = mi.Point2f(offset) + mi.Float(number) * mi.Point2f(*_SHIFT)
-        return light.sample(at.p, normal, moved - dr.floor(moved))
+        place, value = light.sample(at.p, moved - dr.floor(moved))
+        return place, dr.maximum(dr.dot(value, normal), 0)
 
     def _pilots(self, seed: Any, faces: int) -> tuple[list[Any], Any]:
         """Masks of the lights before which a pilot of a face was blocked; whether many pilots met the gel (mi.Bool)."""
@@ -305,7 +315,7 @@ class SeparatedLight:
             return tuple(mi.Float(0) for _ in range(self._channels))
 
         def direct(at: Any, normal: Any, face: Any, offset: Any) -> tuple[Any, ...]:
-            return tuple(self._direct(at, normal, face, offset, shaded, mi.Bool(True)))
+            return tuple(self._direct(at, normal, face, offset, shaded))
 
         for step in range(self.max_depth - 2):
             ray, hit, straight, mirrored = self._onward(at, normal, next(points.numbers), None if step else top)

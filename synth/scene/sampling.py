@@ -2,9 +2,10 @@
 
 With `sampling.common_draws` the scene's hash is left out of what follows.
 
-Sample i belongs to trajectory i // pairs_per_trajectory, and a trajectory to a sensor in the same way. Each level has
-its own random streams, seeded by the scene's hash, the job's seed, the level's name, its number and the attempt: a draw
-that cannot be used is drawn again. Workers, batches and resumption do not enter.
+Sample i belongs to trajectory i // samples_per_trajectory, and a trajectory to a sensor in the same way. A clip shows
+all states of its trajectory, a pair two of them. Each level has its own random streams, seeded by the scene's hash, the
+job's seed, the level's name, its number and the attempt: a draw that cannot be used is drawn again. Workers, batches
+and resumption do not enter.
 """
 
 import zlib
@@ -38,13 +39,13 @@ class SensorInstance:
 
 
 @dataclass(frozen=True)
-class Pair:
+class SampleFrames:
     """One sample's place: its trajectory, sensor and frames (states of the trajectory, 0 undeformed)."""
 
     index: int
     trajectory: int
     sensor: int
-    frames: tuple[int, int]
+    frames: tuple[int, ...]
 
 
 def stream(template: Template, seed: int, purpose: str, *numbers: int) -> np.random.Generator:
@@ -95,22 +96,23 @@ def draw(
     return validated({**sensor.content, **own}, str(template.source), Scene)
 
 
-def pairs_of(template: Template, seed: int, trajectory: int, steps: int) -> list[Pair]:
-    """All samples of a trajectory with that many recorded states.
+def samples_of(template: Template, seed: int, trajectory: int, steps: int) -> list[SampleFrames]:
+    """All samples of a trajectory with that many recorded states: a clip of all of them, or pairs.
 
-    The first shows the undeformed gel and the last state; the others are drawn from all other pairs i < j.
+    The first pair shows the undeformed gel and the last state; the others are drawn from all other pairs i < j.
     """
-    count = template.sampling.pairs_per_trajectory
+    sensor, count = sensor_of(template, trajectory), template.sampling.samples_per_trajectory
+    if template.sampling.kind == "clips":
+        return [SampleFrames(trajectory, trajectory, sensor, tuple(range(steps + 1)))]
     others = [(i, j) for i in range(steps) for j in range(i + 1, steps + 1) if (i, j) != (0, steps)]
     rng = stream(template, seed, "pairs", trajectory)
     frames = [(0, steps), *(others[k] for k in rng.permutation(len(others)))]
-    sensor = sensor_of(template, trajectory)
-    return [Pair(trajectory * count + k, trajectory, sensor, frames[k]) for k in range(count)]
+    return [SampleFrames(trajectory * count + k, trajectory, sensor, frames[k]) for k in range(count)]
 
 
 def check_pairs(scene: Scene) -> None:
     """Refuse a trajectory that has fewer different pairs than it is to give."""
-    asked, steps = scene.sampling.pairs_per_trajectory, scene.motion.steps
+    asked, steps = scene.sampling.samples_per_trajectory, scene.motion.steps
     most = steps * (steps + 1) // 2
     if asked > most:
         raise InputError(

@@ -7,14 +7,14 @@ through the gel toward the camera, +x right and +y down in the image (a left-han
 """
 
 import math
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from synth.scene.indenter import Indenter
 from synth.scene.motion import Motion
 from synth.scene.numerics import Numerics, Render
-from synth.scene.part import Part
+from synth.scene.part import Part, Positive
 from synth.scene.sensor import Sensor
 
 
@@ -26,23 +26,37 @@ class Contact(Part):
 
 
 class Outputs(Part):
-    """Optional channels of flow.exr."""
+    """Whether there are images, and optional channels of flow files."""
 
+    images: bool = True
+    """false: nothing is rendered; flow, states and channels are the same."""
     backward: bool = True
     depth: bool = False
     normal: bool = False
     displacement: bool = False
     traction: bool = False
     contact: bool = False
+    slip: bool = False
+    """Of clips: what moved along the object since the frame before."""
+    previous: bool = False
+    """Of clips: also the flow from the frame before."""
 
 
 class Sampling(Part):
-    """How random instances are shared: samples of a trajectory, trajectories of a sensor, values of several scenes."""
+    """What a sample is, and how instances are shared: samples of a trajectory, trajectories of a sensor, values."""
 
+    kind: Literal["pairs", "clips"] = "pairs"
+    """pairs: two states of a trajectory; clips: all recorded states of one."""
+    frames_per_second: Positive = 25.0
+    """Of clips."""
     pairs_per_trajectory: Annotated[int, Field(ge=1, le=1000)] = 2
     trajectories_per_sensor: Annotated[int, Field(ge=1, le=100000)] = 2
     common_draws: bool = False
     """Draw by seed and number alone: scenes that differ in fixed values get the same gels and presses."""
+
+    @property
+    def samples_per_trajectory(self) -> int:
+        return 1 if self.kind == "clips" else self.pairs_per_trajectory
 
 
 class Scene(Part):
@@ -63,6 +77,9 @@ class Scene(Part):
     def _plausible(self) -> "Scene":
         gel, size, motion = self.sensor.gel, self.sensor.gel.size_mm, self.motion
         self._check_place()
+        for name in ("slip", "previous"):
+            if getattr(self.outputs, name) and self.sampling.kind != "clips":
+                raise ValueError(f'outputs.{name} = true: pairs have no frame before; give sampling.kind = "clips"')
         deepest = 0.85 * (gel.depth_mm - (0.0 if gel.is_round else gel.face_mm(*motion.position_mm)))
         if motion.depth_mm < -50:
             raise ValueError(f"motion.depth_mm = {motion.depth_mm} leaves the indenter farther than 50 mm off the gel")

@@ -19,6 +19,10 @@ SUBDIVISIONS = 8
 """Parts of an element's edge at whose ends gaps are measured."""
 
 
+SLIP_MM = 1e-3
+"""A point that moved less along the body stuck: contact that sticks is elastic (docs/decisions.md)."""
+
+
 class ContactPatch:
     """The part of a contact face that touches.
 
@@ -28,6 +32,7 @@ class ContactPatch:
 
     def __init__(self, face: ContactFaces, displacement: FloatArray, body: RigidBody, pose: Pose, deepest_mm: float):
         """A state by displacements (n, 3) mm of the face's nodes, the body's pose and the deepest penetration."""
+        self._pose = pose
         self._distance = Distance(body, pose.centre[None], pose.rotation[None])
         self._deepest = deepest_mm if deepest_mm > 0 else -np.inf  # that of a state without contact is 0
         self._closed = self._apart = np.zeros((0, 3))
@@ -63,6 +68,18 @@ class ContactPatch:
         """(n,) which material points (n, 3) mm, by their undeformed and deformed places, touch."""
         filled = (_away(material, self._closed) <= self._reach) & (_away(material, self._apart) > self._reach)
         return np.asarray(filled | (self._gap(deformed) <= self._deepest))
+
+    def slip(self, earlier: "ContactPatch", material: Points, before: Points, now: Points) -> FloatArray:
+        """Which points slipped since an earlier state: 1 where they moved along the body, 0 where not, NaN if apart.
+
+        Points are (n, 3) mm, undeformed, in the earlier state and in this one; one that came to touch since has stuck.
+        """
+        moved = (now - self._pose.centre) @ self._pose.rotation
+        moved -= (before - earlier._pose.centre) @ earlier._pose.rotation
+        normal = self._distance(now, np.zeros(len(now), dtype=np.int32))[0] @ self._pose.rotation
+        moved -= (moved * normal).sum(axis=1, keepdims=True) * normal
+        slid = (np.linalg.norm(moved, axis=1) > SLIP_MM) & earlier.holds(material, before)
+        return np.where(self.holds(material, now), slid, np.nan)
 
     def _gap(self, deformed: Points) -> FloatArray:
         return self._distance(deformed, np.zeros(len(deformed), dtype=np.int32))[1]

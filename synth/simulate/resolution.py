@@ -34,7 +34,7 @@ ELEMENTS_ACROSS = (4, 6, 8, 10, 12, 14, 16)
 FINER = (20, 24, 32)
 """More of them, for a stated `fillet_mm` alone: they take minutes."""
 CONTACT_ACROSS = 12
-"""Fewest elements across the contact where outputs.contact asks for its edge."""
+"""Fewest elements across the contact where outputs.contact or slip asks for its edge."""
 ELEMENTS: dict[str, Callable[[], Element]] = {"auto": p2p1, "p1p1": p1p1, "p2p1": p2p1}
 TALLEST = 1.8
 """Largest height over width of the elements under the contact."""
@@ -213,7 +213,7 @@ def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolu
     gel = scene.sensor.gel
     focus = _focus(scene, folder)
     stated = getattr(scene.contact.indenter, "fillet_mm", None)
-    least = CONTACT_ACROSS if scene.outputs.contact else 0
+    least = CONTACT_ACROSS if scene.outputs.contact or scene.outputs.slip else 0
     usual = mesh_levels(gel, focus)
     finer = [] if stated is None else mesh_levels(gel, focus, FINER)
     for number, fineness in enumerate([*usual, *finer], 1):

@@ -1,7 +1,8 @@
 """Verification of samples and datasets: all checks together.
 
-The flow and its visibility are derived again at every pixel, in each direction. Of optional channels (depth, normal,
-displacement, traction, contact) it is checked that they are there (`flow_file_problems`); their values are not
+The flow and its visibility are derived again at every pixel, in each direction, of a clip for every frame, and where
+there is one the flow from the frame before. Of optional channels (depth, normal, displacement, traction, contact, slip)
+it is checked that they are there (`flow_file_problems`); their values are not
 derived again.
 """
 
@@ -12,10 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from synth.arrays import FloatArray
 from synth.dataset.exr import ALIASES, OPTIONAL, read_channels
-from synth.dataset.reader import Dataset, SampleData, read_dataset
+from synth.dataset.reader import Dataset, read_dataset
+from synth.dataset.sample import Layout
+from synth.dataset.sample_reader import SampleData, read_clip, read_meta
 from synth.errors import InputError
 from synth.scene import Outputs, Scene, Sensor
+from synth.surface import GelSurface
 from synth.verify.camera import ForwardCamera
 from synth.verify.motion import check_motion
 from synth.verify.photometry import check_photometry
@@ -47,30 +52,53 @@ def verify_sample(index: int, scene: Scene, sample: SampleData, problems: Sequen
     """
     checks = [_files(problems)]
     for name, sensor in scene.sensor.views.items():
-        prefix = f"{name}: " if name else ""
         if name and name not in sample.further:
-            checks.append(Check(f"{prefix}images", 1.0, 0, "missing", "the scene has this camera, the sample has not"))
+            checks.append(Check(f"{name}: images", 1.0, 0, "missing", "the scene has this camera, the sample has not"))
             continue
-        own = _view_checks(sensor, scene.outputs.backward, sample.seen_by(name))
-        checks += [replace(check, name=prefix + check.name) for check in own]
+        seen = sample.seen_by(name)
+        near, far = (_sheet(sensor, sample.surface, u) for u in (seen.displacement1, seen.displacement2))
+        checks += _named(name, _pair_checks(sensor, scene.outputs.backward, seen, near, far))
     return SampleReport(index, tuple(checks))
 
 
-def _view_checks(sensor: Sensor, backward: bool, sample: SampleData) -> list[Check]:
+def verify_clip(index: int, scene: Scene, folder: Path, problems: Sequence[str] = ()) -> SampleReport:
+    """Verifies each frame of a clip against its own geometry; a check's figure is that of its worst frame."""
+    worst: dict[str, Check] = {}
+    for name, sensor in scene.sensor.views.items():
+        clip = read_clip(folder, name)
+        first = before = _sheet(sensor, clip.surface, clip.displacements[0])
+        for frame in range(1, len(clip)):
+            pair, now = clip.pair(0, frame), _sheet(sensor, clip.surface, clip.displacements[frame])
+            checks = _pair_checks(sensor, scene.outputs.backward, pair, first, now)
+            if scene.outputs.previous:
+                u, v, visible = (pair.flow.extras[f"previous.{part}"] for part in ("U", "V", "visible"))
+                checks += check_motion("previous", before, now, np.stack([u, v], axis=-1), visible)
+            for check in _named(name, checks):
+                told = replace(check, detail=f"frame {frame}: {check.detail}")
+                worst[check.name] = max(worst.get(check.name, told), told, key=lambda one: one.badness)
+            before = now
+    return SampleReport(index, (_files(problems), *worst.values()))
+
+
+def _named(camera: str, checks: Sequence[Check]) -> list[Check]:
+    return [replace(check, name=f"{camera}: {check.name}" if camera else check.name) for check in checks]
+
+
+def _sheet(sensor: Sensor, surface: GelSurface, displacement: FloatArray) -> Sheet:
+    camera, moved = sensor.camera, surface.positions(displacement)
+    return Sheet(ForwardCamera.of(sensor), surface.triangles, moved, camera.width, camera.height)
+
+
+def _pair_checks(sensor: Sensor, backward: bool, sample: SampleData, near: Sheet, far: Sheet) -> list[Check]:
     camera, flow = sensor.camera, sample.flow
-    forward = ForwardCamera.of(sensor)
-    states = [
-        Sheet(forward, sample.surface.triangles, sample.surface.positions(u), camera.width, camera.height)
-        for u in (sample.displacement1, sample.displacement2)
-    ]
-    checks = check_motion("forward", states[0], states[1], flow.forward, flow.forward_visible)
+    checks = check_motion("forward", near, far, flow.forward, flow.forward_visible)
     if flow.backward is not None and flow.backward_visible is not None:
-        checks += check_motion("backward", states[1], states[0], flow.backward, flow.backward_visible)
+        checks += check_motion("backward", far, near, flow.backward, flow.backward_visible)
     elif backward:
         checks.append(Check("backward flow", 1.0, 0, "missing", "the scene asks for it and flow.exr lacks it"))
-    size = (camera.height, camera.width)
-    if flow.forward.shape[:2] == size and sample.image1.shape[:2] == size:
-        checks.append(check_photometry(sensor, sample.image1, sample.image2, flow.forward, flow.forward_visible))
+    size, image1, image2 = (camera.height, camera.width), sample.image1, sample.image2
+    if image1 is not None and image2 is not None and flow.forward.shape[:2] == size and image1.shape[:2] == size:
+        checks.append(check_photometry(sensor, image1, image2, flow.forward, flow.forward_visible))
     return checks
 
 
@@ -78,9 +106,11 @@ def _verify_files(dataset: Dataset, index: int) -> SampleReport:
     problems: list[str] = []
     try:
         problems += dataset.check_hashes(index)
-        scene, sample = dataset.scene_of(index), dataset.read(index)
-        problems += flow_file_problems(dataset.folder(index), scene, sample.meta)
-        return verify_sample(index, scene, sample, problems)
+        scene, folder = dataset.scene_of(index), dataset.folder(index)
+        problems += flow_file_problems(folder, scene, read_meta(folder))
+        if dataset.layout.is_of_clips:
+            return verify_clip(index, scene, folder, problems)
+        return verify_sample(index, scene, dataset.read(index), problems)
     except (InputError, OSError, MemoryError, RecursionError) as error:
         return SampleReport(index, (_files([*problems, str(error) or "out of memory"]),))
 
@@ -90,10 +120,11 @@ def _files(problems: Sequence[str]) -> Check:
 
 
 def flow_file_problems(folder: Path, scene: Scene, meta: Mapping[str, Any]) -> list[str]:
-    """What is wrong with channels and headers of a sample's flow.exr files; InputError if one is missing or damaged."""
+    """What is wrong with channels and headers of a sample's flow files; InputError if one is missing or damaged."""
     problems = []
-    for camera in scene.sensor.views:
-        name = f"{camera}/flow.exr" if camera else "flow.exr"
+    for name in Layout.of(scene.model_dump()).files(len(meta.get("frames", (0, 1)))):
+        if not name.endswith(".exr"):
+            continue
         planes, header = read_channels(folder / name)
         found = [*_channel_problems(planes, scene.outputs), *_header_problems(header, meta)]
         problems += [f"{name}: {problem}" for problem in found]

@@ -13,7 +13,7 @@ from benchmarks.budget import LEAST_SEEN, drawn, judge, picture_errors, places, 
 from benchmarks.press import face_displacement
 from benchmarks.rows import Row, read
 from synth.errors import InputError
-from synth.scene.sampling import draw, pairs_of
+from synth.scene.sampling import draw, samples_of
 from synth.scene.template import load_scene
 from synth.simulate import simulate
 from synth.simulate.footprint import footprint
@@ -136,7 +136,7 @@ def test_the_command(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
     # The last draw again, by hand.
     gel, zone = scene.sensor.gel, footprint(path_of(scene, tiny.parent), scene.sensor.gel.size_mm, MARGIN)
     fine = scene.model_copy(update={"numerics": scene.numerics.model_copy(update={"max_step_mm": 0.125})})
-    frames = sorted({k for pair in pairs_of(template, 2, 1, scene.motion.steps) for k in pair.frames} - {0})
+    frames = sorted({k for pair in samples_of(template, 2, 1, scene.motion.steps) for k in pair.frames} - {0})
     presses = (scene, best.mesh), (fine, reference_mesh(gel, zone, best.spacing_mm, 8)[0])
     found, should = (face_displacement(simulate(*press), places(scene), frames) for press in presses)
     # Corrections of the reference may take more iterations, which changes it by much less than its distance.

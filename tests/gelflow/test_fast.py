@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 import torch
 from commands import refused
-from dots import Turn, centres, grid, picture
+from dots import PITCH, Turn, centres, grid, picture
 from numpy.typing import NDArray
 from waves import moved_pair, press_flow
 
 import gelflow
 from gelflow.baselines.classical import dis
+from gelflow.fast import start
 from gelflow.fast.certainty import refined
 from gelflow.fast.registration import CONFIG, Prepared, register
 from gelflow.models.registration import registered
@@ -41,6 +42,47 @@ def test_its_error_is_at_most_half_of_the_best_preset_of_dis_and_sigma_tells_it(
     assert (off <= found.sigma[20:-20, 20:-20]).mean() > 0.5
     assert np.median(found.sigma) < 0.5
     assert found.visible[20:-20, 20:-20].min() > 0.9
+
+
+@pytest.mark.parametrize("largest", [16.0, 26.0])
+def test_dots_taken_for_the_next_ones_are_seen_and_the_network_finds_them(largest: float, monkeypatch) -> None:
+    image1, image2, truth = pressed_dots(largest)
+    model, asked = gelflow.load_model("fast"), []
+    found, off = model.estimate(image1, image2), error(model.flow(image1, image2), truth)
+    assert (off > PITCH / 2).mean() < 1e-3
+    assert np.median(found.sigma) < 0.5
+    monkeypatch.setattr(start, "_shipped", lambda: lambda one, _: asked.append(1) or 0 * one[..., :2])
+    found = model.estimate(image1, image2)
+    wrong = np.hypot(*np.moveaxis(found.flow - truth, -1, 0)) > PITCH / 2
+    assert asked
+    assert wrong.mean() > 0.02
+    # Of pixels that err by more than half a pitch, at most 5 % say sigma < 1 px.
+    assert (found.sigma[wrong] < 1).mean() < 0.05
+    assert (found.sigma < 1).mean() > 0.5
+
+
+def test_no_network_is_asked_where_dots_move_little(monkeypatch) -> None:
+    monkeypatch.setattr(start, "_shipped", None)
+    image1, image2, truth = pressed_dots(6.0)
+    found = gelflow.load_model("fast").estimate(image1, image2)
+    assert (found.sigma < 1).all()
+    assert error(found.flow, truth).max() < PITCH / 2
+
+
+def test_a_part_that_jumped_by_a_pitch_is_unknown_although_it_explains_the_images() -> None:
+    """A regular grid at rest, and a flow that is off by a pitch in a disc."""
+    places = np.arange(-PITCH, WIDTH + PITCH, PITCH)
+    dots = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
+    x, y = grid(HEIGHT, WIDTH)
+    first = Prepared(picture(x, y, dots))
+    inside = np.hypot(x - 160, y - 120) < 50
+    flow = np.where(inside[..., None], (PITCH, 0), 0).astype(np.float32)
+    found = refined(register(flow, first, first), first, first)
+    off = first.on_image(np.linalg.norm(found.flow, axis=-1)) > PITCH / 2
+    assert off.mean() > 0.8 * inside.mean()
+    assert (first.on_image(found.sigma) < 1)[off].mean() < 0.05
+    # The cut is a ring of some 12 px, and three cells wider for gaps.
+    assert first.on_image(found.known.astype(np.float32))[np.hypot(x - 160, y - 120) > 85].min() == 1
 
 
 def test_it_registers_as_the_network_does_from_the_same_start() -> None:

@@ -24,7 +24,7 @@ from gelflow.files.image import read_image
 from gelflow.files.tensors import Unreadable, load_tensors
 from gelflow.files.video import newest_frames
 from gelflow.models.weights import load_weights, weights_file
-from gelflow.predict.live import Page
+from gelflow.predict.page import Page
 
 OUTSIDE = ["/tmp/x", "../x", "a/../../x", "a\0b", "..\\x", ""]
 

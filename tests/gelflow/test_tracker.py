@@ -4,6 +4,7 @@ import pickle
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from commands import refused
 from dots import PITCH, Turn, centres
@@ -11,7 +12,10 @@ from numpy.typing import NDArray
 from textures import as_bytes, moved, table, write_video
 
 import gelflow
+from gelflow.arrays import Estimate
 from gelflow.cli import main
+from gelflow.fast import start
+from gelflow.track.markers import Markers
 
 SIZE = (160, 208)
 DOTS = centres(*SIZE)
@@ -54,6 +58,48 @@ def test_after_a_cut_nothing_is_known_and_the_next_frame_is_found() -> None:
     found = tracker.update(motion.frame(*SIZE, DOTS))
     assert off(found.flow, motion) < 0.1
     assert not tracker.update(motion.frame(*SIZE, DOTS)).afresh
+
+
+def test_a_ramp_of_exposure_is_unknown_asks_no_network_and_the_stream_goes_on(monkeypatch) -> None:
+    monkeypatch.setattr(start, "_shipped", None)
+    tracker = gelflow.Tracker(frame())
+    light = [1.0, 0.15, 0.03, 0.1, 0.9, 1.0, 1.0]
+    found = []
+    for number, factor in enumerate(light):
+        motion = Turn(shift=(1.0 + number, 0.0))
+        found.append(tracker.update((factor * motion.frame(*SIZE, DOTS)).astype(np.uint8)))
+    assert [float((each.sigma < 1).mean()) > 0.5 for each in found] == [factor > 0.5 for factor in light]
+    assert off(found[-1].flow, motion) < 0.1
+    assert not found[-1].afresh
+
+
+def test_a_stream_that_begins_in_contact_counts_motion_from_there() -> None:
+    tracker = gelflow.Tracker(frame(turn=3.0, shift=(4.0, 0.0)))
+    found = tracker.update(frame(turn=3.0, shift=(6.0, 0.0)))
+    inner = found.flow[20:-20, 20:-20]
+    assert np.abs(np.median(inner, axis=(0, 1)) - (2, 0)).max() < 0.1
+
+
+def test_frames_of_another_kind_are_taken_if_they_show_the_same() -> None:
+    tracker, motion = gelflow.Tracker(frame()), Turn(shift=(2.0, 0.0))
+    image = motion.frame(*SIZE, DOTS)
+    for same in (image, image.astype(np.float32) / 255, image.astype(np.uint16) * 257, image[..., [0, 1, 2, 2]]):
+        assert off(tracker.update(same).flow, motion) < 0.1
+
+
+def test_of_two_markers_at_one_place_only_the_surer_one_is_seen() -> None:
+    image = frame().astype(np.float32) / 255
+    markers = Markers(image)
+    still = Estimate(np.zeros((*SIZE, 2), np.float32), np.full(SIZE, 0.1, np.float32), np.ones(SIZE, np.float32))
+    rest = markers.at(still, image)
+    one, other = np.argsort(np.hypot(rest["x"] - SIZE[1] / 2, rest["y"] - SIZE[0] / 2))[:2]
+    row, column = np.indices(SIZE) + 0.5
+    near = np.hypot(column - rest["x"][one], row - rest["y"][one]) < 8
+    still.flow[near] = [rest["x"][other] - rest["x"][one], rest["y"][other] - rest["y"][one]]
+    still.sigma[near] = 0.2
+    moved = markers.at(still, image)
+    assert rest["visible"].all()
+    assert list(np.flatnonzero(~moved["visible"])) == [one]
 
 
 def test_wrong_frames_and_times_are_refused_and_leave_no_trace() -> None:
@@ -116,14 +162,21 @@ def test_markers_need_no_grid_and_a_dead_one_disturbs_no_other() -> None:
 
 
 def test_the_network_takes_over_where_the_stream_is_lost(monkeypatch) -> None:
+    """A turn by 14 degrees at once: at the border, dots move by more than half their distance."""
     tracker = gelflow.Tracker(frame(), weights="best")
-    asked = []
-    network = tracker._network.flow
-    monkeypatch.setattr(tracker._network, "flow", lambda *images: asked.append(1) or network(*images))
+    network, asked = tracker._network, []
+    monkeypatch.setattr(tracker, "_network", lambda *images: asked.append(1) or network(*images))
     for number in range(1, 4):
         motion = Turn(shift=(2.0 * number, 0.0))
         assert off(tracker.update(motion.frame(*SIZE, DOTS)).flow, motion) < 0.1
-    assert len(asked) == 1
+    assert not asked
+    motion = Turn(14.0, shift=(2.0, 0.0))
+    found = tracker.update(motion.frame(*SIZE, DOTS))
+    assert asked
+    assert found.afresh
+    truth = motion.flow(*SIZE)
+    wrong = np.hypot(*np.moveaxis(found.flow - truth, -1, 0)) > PITCH / 2
+    assert wrong[found.sigma < 1].mean() < 0.01
 
 
 @pytest.mark.parametrize("weights", [["--weights", "fast"], ["--method", "farneback"]])
@@ -145,3 +198,39 @@ def test_the_commands_write_markers_as_a_table(tmp_path: Path, weights: list[str
     capsys.readouterr()
     assert main(["predict", str(video), "--out", str(tmp_path), "--markers", "--reference", "previous", *weights]) == 2
     assert "leave out --reference previous" in capsys.readouterr().err
+
+
+def write_places(path: Path, size: tuple[int, int]) -> Path:
+    """A camera's places of 0.05 mm a px along x and 0.1 along y, 1 mm off."""
+    row, column = (np.indices(size) + 0.5).astype(np.float32)
+    planes = {"place.X": 0.05 * column - 1, "place.Y": 0.1 * row - 1}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, planes).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("command", ["predict", "live"])
+def test_with_a_scene_markers_are_in_millimetres(tmp_path: Path, command: str, capsys) -> None:
+    video, scene = tmp_path / "a.avi", write_places(tmp_path / "places.exr", SIZE)
+    write_video(video, [frame(shift=(shift, shift / 2)) for shift in range(4)], 10.0)
+    out = tmp_path / "markers.csv"
+    options = ["--out", tmp_path, "--markers"] if command == "predict" else ["--markers", out]
+    tables = []
+    for further in ([], ["--scene", scene]):
+        assert main([command, str(video), "--weights", "fast", *map(str, [*options, *further])]) == 0
+        tables.append([row for row in table(out) if row["frame"] == "3" and row["visible"] == "1"])
+    pixels, millimetres = tables
+    assert len(pixels) == len(millimetres) > 10
+    for px, mm in zip(pixels, millimetres, strict=True):
+        x, y, u, v, sigma = (float(px[name]) for name in ("x", "y", "u", "v", "sigma"))
+        given = [float(mm[name]) for name in ("x_mm", "y_mm", "u_mm", "v_mm", "sigma_mm")]
+        # Numbers have four digits, and OpenCV reads places in steps of 1/32 px.
+        np.testing.assert_allclose(
+            given, [x / 20 - 1, y / 10 - 1, u / 20, v / 10, sigma / 200**0.5], atol=0.1 / 32 + 1e-4
+        )
+    capsys.readouterr()
+    assert main([command, str(video), *map(str, options), "--scene", str(write_places(scene, (32, 32)))]) == 2
+    assert "--scene: it has 32x32 px, the frame 208x160" in capsys.readouterr().err
+    assert main([command, str(video), *map(str, options), "--scene", str(video)]) == 2
+    assert main([command, str(video), "--out", str(tmp_path), "--scene", str(scene)]) == 2
+    assert "--scene: is for --markers" in capsys.readouterr().err

@@ -16,7 +16,7 @@ import numpy as np
 from kinematic_double import sheet
 
 from synth.dataset.job import Job
-from synth.dataset.sample import Sample
+from synth.dataset.sample import CameraFrames, Sample
 from synth.dataset.sample_files import write_sample_files
 from synth.dataset.writer import DatasetWriter
 from synth.flow.field import FlowField
@@ -36,6 +36,16 @@ SCENE = {
 }
 
 
+class PairSample(Sample):
+    """A pair with one camera, and its parts by name."""
+
+    image1 = property(lambda self: self.cameras[""].images[0])
+    image2 = property(lambda self: self.cameras[""].images[1])
+    flow = property(lambda self: self.cameras[""].flows[0])
+    displacement1 = property(lambda self: self.displacements[0])
+    displacement2 = property(lambda self: self.displacements[1])
+
+
 def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """(..., 3) in [0, 1]."""
     waves = [np.cos(0.7 * x + 0.3 * y + k) + np.cos(0.4 * y - 0.2 * x + 2 * k) for k in range(3)]
@@ -44,7 +54,7 @@ def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def translation_sample(
     index: int = 0, shift: tuple[float, float] = (1.25, -0.5), *, dtype: type = np.uint8, grey: bool = False
-) -> Sample:
+) -> PairSample:
     """The gel moves by `shift` px. The last two columns see no gel; what moves off the image is not visible."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     x, y, full = columns + 0.5, rows + 0.5, np.iinfo(dtype).max
@@ -66,8 +76,9 @@ def translation_sample(
     }  # fmt: skip
     flow = FlowField(forward, visible(1), -forward, visible(-1), extras={"contact.Y": contact})
     moved = rest + np.array([shift[0] / 4, shift[1] / 4, 0.0])
-    return Sample(
-        *images, flow, index, index // 2, (0, 3), 7, Scene.model_validate(SCENE), surface, rest, moved,
+    return PairSample(
+        index, index // 2, (0, 3), 7, Scene.model_validate(SCENE), surface, (rest, moved),
+        {"": CameraFrames((HEIGHT, WIDTH), tuple(images), (flow,))},
         diagnostics={"solver": [solver, {**solver, "depth_mm": np.float64(0.2)}]},
         force_n=np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 1.5]]),
         torque_nmm=np.zeros((2, 3)),
@@ -127,7 +138,7 @@ def tree(directory: Path) -> dict[str, bytes]:
     return {str(file.relative_to(directory)): file.read_bytes() for file in files}
 
 
-def synth_sample(index: int, dtype: type = np.uint8) -> Sample:
+def synth_sample(index: int, dtype: type = np.uint8) -> PairSample:
     """An exchange of any two arrays shows, and of rows or columns; the first rows and columns see no gel."""
     from textures import moved  # of the tests of gelflow
 
@@ -137,4 +148,4 @@ def synth_sample(index: int, dtype: type = np.uint8) -> Sample:
     seen = (rng.random((2, 64, 64)) < 0.7).astype(np.float32)
     flows[:, :4, :9], seen[:, :4, :9] = np.nan, 0
     flow = FlowField(flows[0], seen[0], flows[1], seen[1])
-    return replace(translation_sample(index), image1=images[0], image2=images[1], flow=flow)
+    return replace(translation_sample(index), cameras={"": CameraFrames((64, 64), tuple(images), (flow,))})

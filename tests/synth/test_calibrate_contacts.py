@@ -1,20 +1,28 @@
 """What a ball's contact tells of the lights."""
 
+import json
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
-from commands import refused
+import tomli_w
+from commands import refused, said
 from render_scenes import FAST, needs_llvm, small_sensor
 
 from synth.arrays import FloatArray
+from synth.calibrate.ball_fit import Balls, find_presses
 from synth.calibrate.contact import change, find_contact, flanks
 from synth.calibrate.irradiance import LightGeometry, LitGel
 from synth.calibrate.layouts import chosen
 from synth.calibrate.lights import Target
 from synth.calibrate.pressed_ball import press_ball
 from synth.calibrate.sensor_fit import room_of
+from synth.cli import main
+from synth.render.camera_image import camera_image
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
-from synth.scene import Light, Render, Sensor
+from synth.scene import Light, NoPattern, Render, Sensor
 
 
 def _sensor(*azimuths: float) -> Sensor:
@@ -58,6 +66,45 @@ def test_a_frame_without_a_contact_is_refused() -> None:
     refused("frame: no ball's contact is seen", find_contact, noise, "frame")
 
 
+def _on_a_ball(radius_px: float) -> FloatArray:
+    """What a ball changes, encoded (120, 160, 3): planes of 60 levels within a circle."""
+    y, x = np.mgrid[:120, :160] + 0.5
+    u, v = (x - 80) / radius_px, (y - 60) / radius_px
+    return np.stack([u, -v, v], axis=-1) * (np.hypot(u, v) < 1)[:, :, None] * 60 / 255
+
+
+WRONG = {
+    "no contact": (_on_a_ball(20.0) * 0, 3.0, "b.png: no ball's contact is seen in it"),
+    "another radius": (_on_a_ball(40.0), 1.0, r"has a radius of \S+ mm, which no ball of --radius-mm = 1 makes"),
+    "another sensor": (
+        _on_a_ball(20.0) + 0.1,
+        3.0,
+        "beside the ball it differs by 25.5 of 255 from the frames at rest",
+    ),
+}
+
+
+@pytest.mark.parametrize(("changed", "radius", "message"), WRONG.values(), ids=WRONG)
+def test_frames_that_the_ball_cannot_have_made_are_refused(changed: FloatArray, radius: float, message: str) -> None:
+    rest, bare = np.full((120, 160, 3), 0.4), {"b.png": np.ones((120, 160), dtype=bool)}
+    balls = Balls({"b.png": rest + changed}, radius, 0.5)
+    assert refused(message, find_presses, _sensor(-90.0, 20.0, 140.0), balls, rest, bare).count("\n") == 0
+
+
+def test_a_press_through_the_gel_is_refused() -> None:
+    message = "\\Aa ball of 3 mm pressed in by 2.8 mm: motion.depth_mm = 2.8 is more than 85 %.*\\Z"
+    refused(message, press_ball, _sensor(0.0, 120.0, 240.0), 3.0, 2.8, np.zeros(2), 0.5)
+
+
+def test_a_camera_that_moved_is_refused() -> None:
+    """Light that falls off by a level a pixel, seen 12 px beside."""
+    rest = np.linspace(0.2, 0.8, 172)[None, :, None] * np.ones((120, 1, 3))
+    frame = rest[:, 12:] + _on_a_ball(20.0)
+    balls, bare = Balls({"b.png": frame}, 3.0, 0.5), {"b.png": np.ones((120, 160), dtype=bool)}
+    sensor = _sensor(-90.0, 20.0, 140.0)
+    refused("the camera moved, or it is another sensor's", find_presses, sensor, balls, rest[:, :160], bare)
+
+
 @needs_llvm
 def test_light_on_a_pressed_face_is_what_the_renderer_renders() -> None:
     """With the shadow that the contact throws."""
@@ -87,3 +134,48 @@ def test_a_layout_is_chosen_from_all_around_and_not_near_the_presets() -> None:
     found = chosen([gel], target, like, np.eye(3, dtype=bool), 0.0, room_of(start))
     azimuth = np.degrees(np.arctan2(found.centre[:, 1], found.centre[:, 0]))
     assert azimuth == pytest.approx([-90, 15, 135], abs=15.1)  # candidates are 15 degrees apart
+
+
+@pytest.mark.slow
+@needs_llvm
+def test_known_lights_are_found_from_three_frames_at_rest_and_three_presses(tmp_path: Path, capsys) -> None:
+    """Through the command, started 70 degrees off; a fourth press is judged and not fitted."""
+    azimuths = np.array([-80.0, 35.0, 150.0])
+    truth, start = (
+        _sensor(*azimuths + turn).model_copy(update={"pattern": NoPattern(kind="none")}) for turn in (0, 70)
+    )
+    texture, render = (
+        albedo(truth, np.random.default_rng(0)),
+        Render(samples_per_pixel=36, max_depth=3, light="separated"),
+    )
+    depths, around = (0.45, 0.55, 0.4, 0.5), ((-2, -1.2), (2, 1), (1.8, -1.4), (-1.6, 1.5))
+    presses = [press_ball(truth, 3.0, *each, 0.5) for each in zip(depths, np.array(around), strict=True)]
+    still = presses[0].surface
+    faces = [(still, still.material)] * 3 + [(press.surface, press.positions) for press in presses]
+    for number, (surface, positions) in enumerate(faces):
+        radiance = Renderer(truth, render, surface, texture, FAST).radiance(positions, number)
+        image = camera_image(radiance, truth.camera, np.random.default_rng(number))
+        cv2.imwrite(str(tmp_path / f"{number}.png"), image[:, :, ::-1])
+    sensor = start.model_dump(mode="json", exclude={"further_cameras", "mirrors"}, exclude_none=True)
+    content = {"name": "start", "sensor": sensor, "motion": {"depth_mm": 0.4, "steps": 1},
+               "contact": {"indenter": {"shape": "sphere", "radius_mm": 3.0}, "friction": 0.5},
+               "render": {"light": "separated", "max_depth": 3, "samples_per_pixel": 16}}  # fmt: skip
+    (tmp_path / "start.toml").write_text(tomli_w.dumps(content))
+    rest, fitted = ([tmp_path / f"{k}.png" for k in numbers] for numbers in ((0, 1, 2), (3, 4, 5)))
+    given = ["--frames", *rest, "--ball", *fitted, "--judge-ball", tmp_path / "6.png", "--radius-mm", 3]
+    out = tmp_path / "fit"
+    said(capsys, main, "calibrate", "--scene", tmp_path / "start.toml", *given, "--steps", 16, "--out", out)
+    record = json.loads((out / "calibration.json").read_text())
+    places = np.array([light["position_mm"] for light in record["lights"]])
+    powers = np.array([max(light["power_per_channel"]) for light in record["lights"]])
+    own = np.array([light.position_mm for light in truth.lights])
+    turned = np.degrees(np.arctan2(places[:, 1], places[:, 0])) - azimuths
+    assert np.abs((turned + 180) % 360 - 180).max() < 5  # the bounds that calibration is to keep
+    raised = np.subtract(*(np.degrees(np.arctan2(each[:, 2], np.hypot(*each[:, :2].T))) for each in (places, own)))
+    assert np.abs(raised).max() < 10
+    assert powers == pytest.approx([light.power for light in truth.lights], rel=0.1)
+    assert [Path(contact["frame"]).stem for contact in record["contacts"]] == ["3", "4", "5", "6"]
+    for contact in record["contacts"]:
+        assert max(contact["rms_within"]) < 6  # levels: as between frames, the camera's noise is 2
+        assert np.abs(np.subtract(*contact["azimuth_deg"].values())).max() < 5
+    assert record["verdict"]["good"]

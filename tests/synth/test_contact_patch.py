@@ -125,3 +125,22 @@ def test_asking_for_contact_makes_the_mesh_fine_enough_for_its_edge() -> None:
     asked = drawn.model_copy(update={"outputs": drawn.outputs.model_copy(update={"contact": True})})
     assert MeshRule.of(drawn).resolution(drawn, Path()).across < CONTACT_ACROSS
     assert MeshRule.of(asked).resolution(asked, Path()).across == CONTACT_ACROSS
+
+
+def test_points_slip_that_moved_along_the_body_and_not_those_that_it_carries() -> None:
+    """A flat punch on the whole face goes aside and turns; half of the face goes with it, half stays, and some left."""
+    body = rigid_body(Cylinder(shape="cylinder", radius_mm=20.0))
+    turn, aside = np.radians(0.5), np.array([0.02, -0.01, 0.003])
+    rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])
+    rest = np.array([0.0, 0.0, -body.reach_mm])
+    poses = [Pose(0, (0, 0), 0, rest, body.rotation), Pose(0, (0, 0), 0, rest + aside, rotation @ body.rotation)]
+    nodes = FACE.nodes
+    moved = (nodes - rest) @ rotation.T + rest + aside - nodes
+    carried, apart = nodes[:, :1] > 0, nodes[:, 1:2] > 2
+    moved = np.where(carried, moved, aside * [0, 0, 1]) + np.where(apart, [0, 0, 0.5], 0)
+    before, now = (ContactPatch(FACE, u, body, pose, DEEP) for u, pose in zip((0 * nodes, moved), poses, strict=True))
+    slipped = now.slip(before, nodes, nodes, nodes + moved)
+    far = np.abs(nodes[:, 1] - 2) > 0.3  # of the edge between what touches and what does not
+    expected = np.where(apart, np.nan, np.where(carried, 0.0, 1.0))[:, 0]
+    np.testing.assert_array_equal(slipped[far], expected[far])
+    assert set(np.unique(expected[far & ~np.isnan(expected)])) == {0, 1}

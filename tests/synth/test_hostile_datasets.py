@@ -21,7 +21,7 @@ from synth.cli import main
 from synth.dataset.exr import write_flow
 from synth.dataset.images import read_png
 from synth.dataset.lock import EXPIRES_S, Lease
-from synth.dataset.reader import read_sample
+from synth.dataset.sample_reader import read_sample
 from synth.dataset.store import Store
 from synth.errors import printable
 from synth.flow.field import FlowField

@@ -16,15 +16,16 @@ from synth.arrays import FloatArray, Points
 from synth.cli import main
 from synth.dataset.images import encode_png, read_png
 from synth.dataset.reader import read_dataset
+from synth.render.coating import is_separated
 from synth.render.measured_light import read_measured_light
 from synth.render.renderer import Renderer
-from synth.render.separated_light import is_separated
 from synth.scene import Light, MeasuredLight, Render, Sensor
 from synth.scene.template import load_scene
 
 RENDER = Render(samples_per_pixel=4, max_depth=4, light="separated")
 LEDS, WIDTH, HEIGHT, PITCH = 4, 240, 180, 0.05  # 12 x 9 mm, all of the pad
 AZIMUTHS = np.radians([0.0, 90, 180, 270])
+GSSIM = Path(__file__).parents[3] / "shared/real/gssim"
 SCALE = [0.5, 0.4, 0.45, 0.35]
 
 
@@ -213,3 +214,45 @@ def test_missing_files_and_a_picture_without_tiles_are_refused(tmp_path: Path) -
     refused(r"flat_field: .*led\.png is no picture of 4 equal tiles, 3 side by side", read)
     (tmp_path / "led.png").unlink()
     refused(r"flat_field: .*led\.png cannot be read", read)
+
+
+@needs_llvm
+@pytest.mark.skipif(not GSSIM.is_dir(), reason="no ../shared/real/gssim here: measured light of real devices")
+@pytest.mark.parametrize("name", ["series1_1587_M6G0", "series2_2EF6_4JNW", "modulus1600_570C_TRLJ"])
+def test_real_devices_are_met_at_rest_and_tilted_by_30_degrees(name: str) -> None:
+    """Against the published formula with the published picture: rest within 2 levels, tilts within 10 per cent."""
+    text, png = (GSSIM / f"{name}.yaml").read_text(), cv2.imread(str(GSSIM / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+    number = {key: float(re.search(rf"^{key}: (\S+)", text, re.M)[1]) for key in ("width", "height", "mmperpixel")}
+    wide, high = (number[key] * number["mmperpixel"] for key in ("width", "height"))
+    values = json.loads(re.search(r"quadfit:.*?values: (\[.*?\])", text, re.S)[1])
+    scale = json.loads(re.search(r"flatfield:.*?scale: (\[.*?\])", text, re.S)[1])
+    numbers = np.array(values).reshape(6, 6, 10)
+    png = png if png.ndim == 2 else png[:, :, 0]
+    rows, columns = png.shape[0] // 2, png.shape[1] // 3
+    first = _lit().lights
+    lights = (*first[:3], *[first[3]] * 3)
+    focal = 80 / wide * (1000 - 6 + 6)
+    camera = {"position_mm": (0.0, 0.0, 1000.0), "look_at_mm": (0.0, 0.0, 0.0), "cx": 40.0, "cy": 30.0}
+    sensor = small_sensor(1.0, None, lights, **camera, fx=focal, fy=focal)
+    sensor = sensor.model_copy(update={
+        "gel": sensor.gel.model_copy(update={"size_mm": (1.2 * wide, 1.2 * high, 3.0)}),
+        "measured_light": MeasuredLight(file=f"{name}.yaml", flat_field=f"{name}.png")})  # fmt: skip
+    x, y = np.meshgrid((np.arange(80) + 0.5 - 40) * wide / 80, (np.arange(60) + 0.5 - 30) * wide / 80)
+    u, v = x / high, y / high
+    terms = np.stack([u * u, u * v, v * v, u, v, np.ones_like(u)])
+    for polar, azimuth in [(0, 0), *((30, angle) for angle in range(0, 360, 60))]:
+        slope = -np.tan(np.radians(polar)) * np.array([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))])
+        n = np.array([*-slope, 1]) / np.hypot(1, np.linalg.norm(slope))
+        positions = flat_surface(sensor).material.copy()
+        positions[:, 2] = positions[:, :2] @ slope
+        found = _radiance(sensor, GSSIM, positions)[6:-6, 12:-12]
+        for led in range(3):
+            a, b, c, d, e, f, *rest = np.tensordot(numbers[:, led], terms, (0, 0))
+            form = np.einsum("i,ij...,j", n, np.array([[a, b, c], [b, d, e], [c, e, f]]), n)
+            form = np.maximum(form + np.tensordot(n, np.array(rest[:3]), (0, 0)) + rest[3], 0)
+            tile = png[led // 3 * rows : (led // 3 + 1) * rows, led % 3 * columns : (led % 3 + 1) * columns]
+            places = ((x / wide + 0.5) * columns - 0.5, (y / high + 0.5) * rows - 0.5)
+            field = cv2.remap(tile.astype(np.float32) / np.iinfo(png.dtype).max, *(p.astype(np.float32) for p in places), cv2.INTER_AREA)  # fmt: skip # noqa: E501
+            error = np.abs(found[..., led] - (form * field / scale[led])[6:-6, 12:-12])
+            own = found[..., led].mean()
+            assert error.mean() < (2 / 255 if polar == 0 else 0.1 * own)

@@ -8,6 +8,7 @@ from pathlib import Path
 import commands
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 from samples import tree
 from tiny_scene import LIGHTS, SENSOR, reference, write_tiny
@@ -33,6 +34,21 @@ def test_the_picture_is_the_first_of_a_dataset(said, tiny: Path, tmp_path: Path,
     assert "\nmain: light suits the camera\n" in out
     assert re.search(r"^4\.48 px per mm on the gel: .*p\.png$", out, re.MULTILINE)
     np.testing.assert_array_equal(read_png(tmp_path / "p.png"), read_png(reference() / "samples/000000/image1.png"))
+
+
+def test_places_are_where_pixels_see_the_gel(said, tiny: Path, tmp_path: Path) -> None:
+    """Without a window's refraction, a camera 20 mm above the face sees it 20 mm / 82 px times as large."""
+    places = tmp_path / "places.exr"
+    straight = ["--set", "sensor.window.refractive_index=1.0", "--set", "sensor.camera.cx=16.0"]
+    said(tiny, "--places", places, *straight)
+    with OpenEXR.File(str(places), separate_channels=True) as file:
+        found = {name: channel.pixels for name, channel in file.channels().items()}
+    row, column = np.indices((24, 32)) + 0.5
+    # float32 of some mm
+    np.testing.assert_allclose(found["place.X"], (column - 16) * 20 / 82, atol=1e-5)
+    np.testing.assert_allclose(found["place.Y"], (row - 12) * 20 / 82, atol=1e-5)
+    np.testing.assert_allclose(found["place.Z"], 0, atol=1e-5)
+    said(tiny, "--places", places, *straight)  # its own is replaced
 
 
 @pytest.mark.parametrize(("exposure", "words"), [

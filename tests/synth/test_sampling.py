@@ -9,7 +9,7 @@ from commands import refused
 from scipy import stats
 
 from synth.scene import Scene
-from synth.scene.sampling import MAX_DRAWS, check_pairs, draw, draw_sensor, pairs_of, stream
+from synth.scene.sampling import MAX_DRAWS, check_pairs, draw, draw_sensor, samples_of, stream
 from synth.scene.template import Template, load_scene, shipped_scenes
 
 COUNT = 200
@@ -115,13 +115,13 @@ def test_a_sensor_that_cannot_be_used_is_drawn_again_and_at_last_says_why(tiny: 
 def test_pairs_are_numbered_distinct_and_begin_with_the_whole_motion(tiny: Path, pairs: int, steps: int) -> None:
     template = load_scene(tiny, [f"sampling.pairs_per_trajectory={pairs}", "sampling.trajectories_per_sensor=2"])
     for trajectory in range(4):
-        found = pairs_of(template, 0, trajectory, steps)
+        found = samples_of(template, 0, trajectory, steps)
         assert [pair.index for pair in found] == list(range(trajectory * pairs, (trajectory + 1) * pairs))
         assert {(pair.trajectory, pair.sensor) for pair in found} == {(trajectory, trajectory // 2)}
         assert found[0].frames == (0, steps)
         assert len({pair.frames for pair in found}) == pairs
         assert all(0 <= i < j <= steps for i, j in (pair.frames for pair in found))
-        assert found == pairs_of(template, 0, trajectory, steps)
+        assert found == samples_of(template, 0, trajectory, steps)
 
 
 @pytest.mark.parametrize("name", shipped_scenes())

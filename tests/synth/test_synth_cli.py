@@ -39,7 +39,7 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> Run:
     ("", ["generate", "plan", "preview", "simulate", "inspect", "verify", "export", "doctor", "--debug"]),
     ("generate", ["--scene", "--n", "--out", "--seed", "--set", "--device", "--workers", "--dry-run", "--json"]),
     ("plan", ["--scene", "--set", "--n", "--device", "--json"]),
-    ("preview", ["--scene", "--out", "--seed", "--set", "--device", "--json"]),
+    ("preview", ["--scene", "--out", "--places", "--seed", "--set", "--device", "--json"]),
     ("simulate", ["--scene", "--out", "--seed", "--set", "--json"]),
     ("inspect", ["PATH", "--png", "--html", "--json"]),
     ("verify", ["PATH", "--json"]),

@@ -18,7 +18,7 @@ from verified_sample import HEIGHT, WIDTH, as_sample, make_sample, motion_checks
 
 from synth.dataset.exr import read_channels, write_flow
 from synth.dataset.job import Job
-from synth.dataset.reader import SampleData
+from synth.dataset.sample_reader import SampleData
 from synth.dataset.writer import DatasetWriter
 from synth.flow.field import FlowField
 from synth.scene import Outputs

@@ -4,8 +4,8 @@ import numpy as np
 from kinematic_double import LENS, sensor, sheet
 
 from synth.arrays import FloatArray, Points
-from synth.dataset.reader import SampleData
-from synth.dataset.sample import Sample
+from synth.dataset.sample import CameraFrames, Sample
+from synth.dataset.sample_reader import SampleData
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowField
 from synth.flow.trace import trace
@@ -70,8 +70,9 @@ def motion_checks(sensor: Sensor, surface: GelSurface, first: Points, second: Po
 
 
 def as_sample(index: int, drawn: Scene, data: SampleData) -> Sample:
-    pair, rest = (data.image1, data.image2, data.flow), (drawn, data.surface, data.displacement1, data.displacement2)
-    return Sample(*pair, index, 0, (0, 1), 0, *rest)
+    seen = CameraFrames(data.flow.forward.shape[:2], data.images, (data.flow,))
+    moved = (data.displacement1, data.displacement2)
+    return Sample(index, 0, (0, 1), 0, drawn, data.surface, moved, {"": seen})
 
 
 def _paint(positions: Points, optics: Optics, drawn: Scene, rng: np.random.Generator) -> np.ndarray:
