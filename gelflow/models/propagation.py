@@ -39,7 +39,7 @@ MAX_RESIDUAL_RATIO, MAX_RESIDUAL_RATIO_WITHOUT_SHADING = 0.85, 0.6
 """A proposal is taken if its residual is below this share of the pixel's own."""
 PIXELS_PER_DEVIATION = 3
 """Largest standard deviation of a window in the reduced images, px."""
-CACHED_PX = 20000
+CACHED_PX = 50000
 """Px of proposals that are compared at a time on a processor."""
 SLOPE_WINDOW_PX = 2.0
 """Standard deviation of the Gaussian under which a flow is smoothed before it is extrapolated, reduced px."""
@@ -63,7 +63,7 @@ def propagated(flow: Flow, image1: Images, image2: Images, window_px: float, con
 
     def residuals(candidates: Tensor) -> Tensor:
         """E of (N, B, 2, H, W): (N, B, 1, H, W)."""
-        images1, images2 = (image.repeat(len(candidates), 1, 1, 1) for image in (first, second))
+        images1, images2 = (image.expand(len(candidates), *image.shape).flatten(0, 1) for image in (first, second))
         left = windowed_residual(candidates.flatten(0, 1), images1, images2, window, ignore_shading)
         return left.unflatten(0, (len(candidates), -1))
 

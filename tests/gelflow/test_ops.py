@@ -13,8 +13,8 @@ from waves import pixel_centres, wave_image
 
 from gelflow.losses.regularisers import forward_differences, window_slopes
 from gelflow.ops.cached import cached
-from gelflow.ops.correlation import local_correlation
-from gelflow.ops.gaussian import smoother, window_sums
+from gelflow.ops.correlation import _by_blocks, _by_channels, _unfolded, local_correlation
+from gelflow.ops.gaussian import interpolator, smoother, window_sums
 from gelflow.ops.pyramid import enlarge_flow, flow_pyramid, halve_flow, image_pyramid
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import inside, positions, warp
@@ -107,6 +107,30 @@ def test_window_sums_are_a_convolution_and_smoothing_a_gaussian_up_to_the_border
     found = smoother(wave, 2.0)(wave)
     # exp(-s² k² / 2) = 0.726; the window's end at 3 s leaves out 0.3 % of the Gaussian, as does the sum over pixels.
     torch.testing.assert_close(found[..., 20:-20], math.exp(-0.32) * wave[..., 20:-20], rtol=0, atol=5e-3)
+
+
+def test_between_places_at_a_spacing_fields_are_interpolated_and_near_reads_the_splines_values() -> None:
+    y, x = torch.meshgrid(torch.arange(40.0).double(), torch.arange(60.0).double(), indexing="ij")
+    for spacing in (1, 2, 4):
+        places = [axis[::spacing] + (spacing - 1) / 2 for axis in (y[:, 0], x[0])]
+        wave = torch.cos(0.2 * places[0])[:, None] * torch.sin(0.1 * places[1])
+        found = interpolator(y[None, None], spacing)(wave[None, None])
+        # Keys' interpolation errs with the cube of the spacing: here (0.8)^3 / 24 at most, at the middle far less.
+        torch.testing.assert_close(found[0, 0, 8:-8, 8:-8], (torch.cos(0.2 * y) * torch.sin(0.1 * x))[8:-8, 8:-8],
+                                   rtol=0, atol=0.02)  # fmt: skip
+    image = torch.rand(1, 2, 17, 23, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    spline, y, x = SplineImage(image), y[:17, :23], x[:17, :23]
+    for quarter in (0.25, -0.25):
+        at = torch.stack([x + quarter, y - quarter])[None]
+        inner = (..., slice(1, -1), slice(1, -1))  # `at` repeats the border beyond the outer pixels' centres
+        torch.testing.assert_close(spline.near(at)[inner], spline.at(at)[inner], rtol=0, atol=1e-12)
+
+
+def test_both_orders_of_the_correlation_agree() -> None:
+    first, second = torch.rand(2, 2, 3, 7, 45, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    expected = _unfolded(first, second, 2)
+    for correlation in (_by_channels, _by_blocks):
+        torch.testing.assert_close(correlation(first, second, 2), expected, rtol=0, atol=1e-12)
 
 
 def test_derivatives_of_an_affine_field_are_exact_and_window_slopes_the_papers_least_squares() -> None:
