@@ -347,6 +347,4 @@ def _show_summary(summary: Summary, variant: Variant, kind: str) -> None:
 def _console() -> Console:
     """Stdout; tables keep their natural width where it is no terminal."""
     console = Console()
-    if not console.is_terminal:
-        console.width = 10_000  # wider than any table
-    return console
+    return console if console.is_terminal else Console(width=10_000)  # wider than any table

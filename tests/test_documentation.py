@@ -110,7 +110,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_examples_are_short() -> None:
     programs = sorted(EXAMPLES.glob("*.py"))
-    assert len(programs) == 8
+    assert len(programs) == 9
     lines = {program.name: len(program.read_text().splitlines()) for program in programs}
     assert lines.pop("ros2_node.py") <= 60
     assert max(lines.values()) <= 40
