@@ -2,7 +2,8 @@
 
 The sparse factors of this process are made of matrices whose unknowns are numbered at random. They answer to the same
 tolerance, with other roundings, as on another processor. Whoever derives a bound runs its test with several seeds, and
-with `OMP_NUM_THREADS` 1 and 2. Worker processes that a test starts keep the order.
+with `OMP_NUM_THREADS` 1 and 2. Processes that a test starts number theirs as ever, so tests that compare bits with
+theirs (`processes`) are skipped.
 """
 
 import numpy as np

@@ -12,7 +12,7 @@ smoothed, because the flow is. Where the narrow window finds nothing, e + |V - V
 over those places alone of which the images say more than the network: between dots a flow is known unless it bends. A
 bare gel has no such places, so that nothing is known, however plausible its flow. Over all places, wide windows would
 take light for texture. Near specks in the optics, the error of `gelflow.models.specks` is added to e. An error that
-leaves no trace in the images, such as dots taken for the next ones, is not seen.
+leaves no trace in the images is not seen; dots taken for the next ones are `gelflow.fast.certainty`'s matter.
 """
 
 import math

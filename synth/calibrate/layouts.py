@@ -21,7 +21,7 @@ _TRIED, _ROUNDS, _CHUNK = 30, 2, 32
 
 
 def around(like: LightGeometry, room: Room) -> LightGeometry:
-    """Lights around the gel, of the median size and viewing angle of others."""
+    """Lights around the gel, of the median size and viewing angle of others, no part of which is in the view."""
     top, angles = room.high[:, 2].max(), np.radians(np.arange(_AZIMUTHS) * 360 / _AZIMUTHS)
     centres, directions = [], []
     for angle, height, tilt in product(angles, _HEIGHTS, np.radians(_TILTS)):
@@ -33,7 +33,9 @@ def around(like: LightGeometry, room: Room) -> LightGeometry:
         directions.append([*(-outward * np.cos(tilt)), np.sin(tilt)])
     size, angle = np.median(like.size, axis=0), np.median(like.viewing_angle_deg, axis=0)
     count = len(centres)
-    return LightGeometry(np.array(centres), np.array(directions), np.tile(size, (count, 1)), np.tile(angle, (count, 1)))
+    fields = np.array(centres), np.array(directions), np.tile(size, (count, 1)), np.tile(angle, (count, 1))
+    outside = room.intrusion(LightGeometry(*fields)).max(axis=1) == 0
+    return LightGeometry(*(field[outside] for field in fields))
 
 
 def chosen(

@@ -77,12 +77,12 @@ class Room:
     slope: FloatArray
 
     def intrusion(self, lights: LightGeometry) -> FloatArray:
-        """(m, 9) mm by which points of the lights are within the view: 0 outside; the corners, middles and centre."""
+        """(m, 99) mm by which points of the lights, 33 along by 3 across, are within the view: 0 outside."""
         facing = lights.direction / np.linalg.norm(lights.direction, axis=1, keepdims=True)
         first = np.cross([0.0, 0.0, 1.0], facing)
         first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-6)
         along, across = first * lights.size[:, :1], np.cross(facing, first) * lights.size[:, 1:]
-        u, v = (axis.ravel()[:, None] for axis in np.meshgrid(*2 * [np.linspace(-0.5, 0.5, 3)]))
+        u, v = (axis.ravel()[:, None] for axis in np.meshgrid(np.linspace(-0.5, 0.5, 33), np.linspace(-0.5, 0.5, 3)))
         points = lights.centre[:, None] + u * along[:, None] + v * across[:, None]
         low, high = self.view[:, None, None] + self.slope[:, None, None] * points[..., 2:]
         inside = np.minimum(points[..., :2] - low, high - points[..., :2]).min(axis=2)
@@ -178,7 +178,7 @@ class _Problem:
         return np.r_[low.ravel(), dark[0]], np.r_[high.ravel(), dark[1]]
 
     def residual(self, theta: FloatArray) -> FloatArray:
-        """(3 n + len(theta) + 9 m,): weighted misfit by channel, the prior, and how far lights are in the view."""
+        """(3 n + len(theta) + 99 m,): weighted misfit by channel, the prior, and how far lights are in the view."""
         basis, powers, geometry = self._solved(theta)
         miss = np.einsum("mpc,mc->pc", basis, powers) - self._target.signal
         seen = self._room.intrusion(geometry).ravel() / _SEEN_MM
@@ -210,14 +210,14 @@ class _Problem:
         return np.vstack([*blocks, np.eye(self.size), self._seen(theta)])
 
     def _seen(self, theta: FloatArray) -> FloatArray:
-        """(9 m, len(theta)): derivatives of the lights' intrusion into the view; a light's numbers move it alone."""
-        found = np.zeros((self._lights, 9, self._lights, 9))
+        """(99 m, len(theta)): derivatives of the lights' intrusion into the view; a light's numbers move it alone."""
+        found = np.zeros((self._lights, 99, self._lights, 9))
         number = np.arange(self._lights)
         for k in range(9):
             move = np.append(np.tile(_STEP * np.eye(9)[k], self._lights), 0.0)
             more, less = (self._room.intrusion(self.geometry(theta + sign * move)) for sign in (1, -1))
             found[number, :, number, k] = (more - less) / (2 * _STEP * _SEEN_MM)
-        return np.column_stack([found.reshape(9 * self._lights, -1), np.zeros(9 * self._lights)])
+        return np.column_stack([found.reshape(99 * self._lights, -1), np.zeros(99 * self._lights)])
 
     def result(self, theta: FloatArray, steps: int) -> LightFit:
         basis, powers, geometry = self._solved(theta)

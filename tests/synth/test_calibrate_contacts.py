@@ -14,8 +14,8 @@ from synth.arrays import FloatArray
 from synth.calibrate.ball_fit import Balls, find_presses
 from synth.calibrate.contact import change, find_contact, flanks
 from synth.calibrate.irradiance import LightGeometry, LitGel
-from synth.calibrate.layouts import chosen
-from synth.calibrate.lights import Target
+from synth.calibrate.layouts import around, chosen
+from synth.calibrate.lights import Room, Target
 from synth.calibrate.pressed_ball import press_ball
 from synth.calibrate.sensor_fit import room_of
 from synth.cli import main
@@ -179,3 +179,15 @@ def test_known_lights_are_found_from_three_frames_at_rest_and_three_presses(tmp_
         assert max(contact["rms_within"]) < 6  # levels: as between frames, the camera's noise is 2
         assert np.abs(np.subtract(*contact["azimuth_deg"].values())).max() < 5
     assert record["verdict"]["good"]
+
+
+def test_a_long_light_across_a_corner_of_the_view_is_in_it() -> None:
+    """Its ends and its middle are outside; an eighth of it is within."""
+    room = Room(np.full((1, 3), -20.0), np.full((1, 3), 20.0), np.array([[-8.0, -6.0], [8.0, 6.0]]), np.zeros((2, 2)))
+    light = LightGeometry(
+        np.array([[9.0, 4.0, 3.0]]), np.array([[-1.0, -1.0, 0.0]]), np.array([[12.0, 0.5]]), np.array([[60.0]])
+    )
+    assert room.intrusion(light).max() > 0.3
+    tried = around(light, room)
+    assert len(tried.centre) > 100
+    assert room.intrusion(tried).max() == 0

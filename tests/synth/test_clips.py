@@ -159,6 +159,7 @@ def test_a_slide_is_gross_slip_and_slip_is_told_where_there_is_contact(tmp_path:
     assert np.nanmean(clip.flows[-1].extras["slip.Y"]) > 0.7  # pixels at the front came to touch since
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("solver", ["single", "batched"])
 def test_a_clip_that_is_killed_within_is_made_again_to_the_same_bits(
     template: Template, made: Path, tmp_path: Path, solver: str

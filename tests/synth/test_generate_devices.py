@@ -48,6 +48,7 @@ def test_what_one_process_refuses_is_raised() -> None:
         on_devices(_dies, 2, lambda *_: None)
 
 
+@pytest.mark.processes
 def test_the_shards_of_two_devices_are_the_job(tiny: Path, tmp_path: Path) -> None:
     template, out = load_scene(tiny), tmp_path / "d"
     variant = job_variant(template, "cpu")

@@ -62,6 +62,7 @@ def _assert_goes_on(scene: Path, out: Path) -> None:
 
 
 @needs_proc
+@pytest.mark.processes
 def test_killed_with_two_workers_and_started_again(tiny: Path, out: Path) -> None:
     process = started(tiny, out, "--n", "5", "--workers", "2")
     end_family(process, signal.SIGKILL)
@@ -75,6 +76,7 @@ def test_killed_with_two_workers_and_started_again(tiny: Path, out: Path) -> Non
 
 
 @needs_proc
+@pytest.mark.processes
 def test_ctrl_c_with_workers_ends_with_130_one_line_and_no_orphans(tiny: Path, out: Path) -> None:
     process = started(tiny, out, "--n", "400", "--workers", "2")
     stderr = end_family(process, signal.SIGINT)
@@ -99,6 +101,7 @@ def test_ctrl_c_in_one_process_ends_with_130_and_one_line(tiny: Path, out: Path,
 
 
 @needs_proc
+@pytest.mark.processes
 def test_a_killed_worker_is_replaced(tiny: Path, out: Path) -> None:
     """One of two, in mid-task; the run goes on and ends with the files of an undisturbed one."""
     process = started(tiny, out, "--n", "5", "--workers", "2")
@@ -158,6 +161,7 @@ def test_ctrl_c_still_reaches_python_after_meshing() -> None:
     assert done.stdout.endswith("interrupted\n")
 
 
+@pytest.mark.processes
 def test_killed_within_a_sample_and_a_second_process(tiny: Path, out: Path, capsys: pytest.CaptureFixture) -> None:
     """The second one is told; the first is killed the moment a half-written sample can be seen."""
     process = started(tiny, out, "--n", "400")

@@ -22,6 +22,7 @@ ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.usefixtures("one_cache")
 
 
+@pytest.mark.processes
 def test_a_worker_changes_no_bit(tmp_path: Path) -> None:
     """The reference was rendered in this process, on all cores."""
     out = tmp_path / "d"
