@@ -156,7 +156,8 @@ def test_a_slide_is_gross_slip_and_slip_is_told_where_there_is_contact(tmp_path:
         assert (np.isfinite(flow.extras["slip.Y"]) == (flow.extras["contact.Y"] == 1)).all()
     assert (clip.states["gross_slip"] == (clip.states["slip_ratio"] == 1)).all()
     assert clip.states["gross_slip"][[0, -1]].tolist() == [0, 1]
-    assert np.nanmean(clip.flows[-1].extras["slip.Y"]) > 0.7  # pixels at the front came to touch since
+    # Of the 23 pixels in contact those of the front, a strip of about one pixel, came to touch since: about 7.
+    assert np.nanmean(clip.flows[-1].extras["slip.Y"]) > 0.5
 
 
 @pytest.mark.processes
