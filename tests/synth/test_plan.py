@@ -189,7 +189,8 @@ def test_memory_is_as_predicted(tiny: Path, tmp_path: Path, width: int) -> None:
     camera = "\n".join(f"{key} = {share * value}" for key, value in (("fx", 82), ("fy", 82), ("cx", 16), ("cy", 12)))
     size = f"width = {width}\nheight = {width * 3 // 4}\n"
     scene.write_text(f'extends = "{tiny}"\n[render]\nsamples_per_pixel = 4\n[sensor.camera]\n{size}{camera}\n')
-    command = [sys.executable, "-c", MEASURED, str(scene), str(tmp_path / "d")]
-    taken = int(subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()[-1])
+    for out in ("first", "second"):  # the first may compile kernels, which takes up to a gigabyte and is not predicted
+        command = [sys.executable, "-c", MEASURED, str(scene), str(tmp_path / out)]
+        taken = int(subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()[-1])
     template = load_scene(scene)
     assert 1 / 1.5 < predict(plan(template, job_variant(template, "cpu"))).memory_bytes / taken < 1.5
