@@ -137,8 +137,8 @@ class Stepper:
             self.next = len(self._waypoints)
         else:
             self._place(0.0)
-            self.system.residual(self.state, self.indenter)
-            self.system.update_contact_history(self.state, self.indenter)
+            residual = self.system.residual(self.state, self.indenter)
+            self.system.update_contact_history(self.state, residual, self.indenter)
 
     def _advance(self) -> None:
         """One step."""
@@ -151,12 +151,12 @@ class Stepper:
         if relaxed:
             solution = self._counted(relax(self.system, self.state, self.indenter, tolerance))
         good = solution.converged
-        if good and target in self._recorded and not self._slipped_through(target, solution.state):
+        if good and target in self._recorded and not self._slipped_through(target, solution):
             good = self._record(solution, target)
         if good:
             self._previous_state, self.state = self.state, solution.state
             # After the record, whose passes must still see how far points slipped in this step.
-            self.system.update_contact_history(self.state, self.indenter)
+            self.system.update_contact_history(self.state, solution.residual, self.indenter)
             self._lengthen(target, solution.iterations, relaxed)
         else:
             self._shorten(target, relaxed)
@@ -166,13 +166,13 @@ class Stepper:
         self._iterations += solution.iterations
         return solution
 
-    def _slipped_through(self, target: float, state: Unknowns) -> bool:
+    def _slipped_through(self, target: float, solution: Solution) -> bool:
         """Whether the indenter, at the end of its press, bears on nothing: it passed between the contact points.
 
         Ends the press, saying so.
         """
         pressed = target == self.path.press_mm and self.path.is_over(self.system.space.mesh.size_mm)
-        if not pressed or self.system.forces(state)[0] @ self.path.direction > FORCE_FLOOR:
+        if not pressed or self.system.forces(solution.state, solution.residual)[0] @ self.path.direction > FORCE_FLOOR:
             return False
         self.reason = no_contact(target)
         return True
@@ -218,10 +218,10 @@ class Stepper:
         """
         between = min(self._relaxed_tolerance, MULTIPLIER_TOLERANCE * self.numerics.tolerance)
         share, done, failures, passes = 1.0, 0.0, 0, 0
-        if self.system.deepest() > self._shallow_mm:
+        if solution.residual.deepest > self._shallow_mm:
             solution = self._polished(solution, between)
-        while solution.converged and self.system.deepest() > self._shallow_mm:
-            deepest, sharpness = self.system.deepest(), float(self.indenter.sharpness.numpy()[0])
+        while solution.converged and solution.residual.deepest > self._shallow_mm:
+            deepest, sharpness = solution.residual.deepest, float(self.indenter.sharpness.numpy()[0])
             deep = deepest > self._deep_mm
             allowed = MAX_FAILURES if deepest > SINKING * self.path.depth_scale_mm else FAILURES
             over = done >= MAX_MULTIPLIER_UPDATES or failures >= allowed
@@ -233,7 +233,7 @@ class Stepper:
             before = self.system.saved_contact()
             if deep and done > 0:
                 self.indenter.sharpness.fill_(min(2 * sharpness, MAX_STIFFENING * self.path.body.sharpness))
-            self.system.augment(self.indenter, share)
+            self.system.augment(solution.residual, self.indenter, share)
             tolerance = between if deep or done + share < MAX_MULTIPLIER_UPDATES else self.numerics.tolerance
             start, limit, reach = solution.state, self.options.correction_iterations, MAX_CORRECTION_RATIO * deepest
             better = self._counted(solve(self.system, start, self.indenter, tolerance, limit, reach))
@@ -246,7 +246,6 @@ class Stepper:
             else:
                 self.system.restore_contact(before)
                 self.indenter.sharpness.fill_(sharpness)
-                self.system.residual(solution.state, self.indenter)
                 failures, share = failures + 1, share / 2
         return solution
 
@@ -264,9 +263,9 @@ class Stepper:
         saved = self.system.saved_contact()
         solution = step
         if target in self._corrected:
-            self.system.update_contact_history(step.state, self.indenter, new_only=1)
+            self.system.update_contact_history(step.state, step.residual, self.indenter, new_only=1)
             solution = self._augmented(step)
-            if solution.converged and self.system.deepest() > self._allowed_mm:
+            if solution.converged and solution.residual.deepest > self._allowed_mm:
                 self.reason = too_deep(self.path.pose(target), allowed_share(self.path.body))
             else:
                 solution = self._polished(solution, self.numerics.tolerance)
@@ -276,13 +275,14 @@ class Stepper:
         self.indenter.sharpness.fill_(self.path.body.sharpness)
         self.system.restore_contact(saved)
         self.system.forget_factor()
-        self.system.residual(step.state, self.indenter)
         return solution.converged
 
     def _recorded_state(self, solution: Solution, target: float) -> State:
         """A solution that was just found, in the units of a trajectory."""
         pose = self.path.pose(target)
-        force, torque, traction = (self._modulus * value for value in self.system.forces(solution.state))
+        force, torque, traction = (
+            self._modulus * value for value in self.system.forces(solution.state, solution.residual)
+        )
         return State(
             depth_mm=pose.depth_mm,
             shear_mm=pose.shear_mm,
@@ -294,8 +294,8 @@ class Stepper:
             newton_iterations=self._iterations,
             residual=relative_residual(solution.residual),
             min_jacobian=solution.residual.smallest_jacobian,
-            max_penetration_mm=self.system.deepest(),
-            slip_ratio=self.system.slip_ratio(self.indenter),
+            max_penetration_mm=solution.residual.deepest,
+            slip_ratio=self.system.slip_ratio(solution.residual, self.indenter),
         )
 
     def _lengthen(self, target: float, iterations: int, relaxed: bool) -> None:

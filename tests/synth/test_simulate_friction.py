@@ -39,7 +39,7 @@ def test_without_friction_nothing_pulls_sideways(element: str) -> None:
     """No tangential traction anywhere, so the ball's force goes through its centre, and its twist does nothing."""
     numerics = {"element": element}
     stepper = run(gentle(friction=0.0, motion={**DRAG, "shear_mm": [0.0, 0.0]}, numerics=numerics), MESH)
-    assert not stepper.system.tangential.numpy().any()
+    assert not touch(stepper).along.any()
     states = stepper.states
     pressed, twisted = states[2], states[-1]
     assert (pressed.depth_mm, pressed.twist_deg) == (0.6, 0.0)

@@ -22,7 +22,7 @@ from synth.simulate.material import pad_material
 from synth.simulate.press import Press
 from synth.simulate.space import Space, function_space
 from synth.simulate.stepping import Stepper
-from synth.simulate.system import System, Unknowns
+from synth.simulate.system import Residual, System, Unknowns
 
 PRESS = {"depth_mm": 0.8}
 DRAG = {"depth_mm": 0.8, "shear_mm": [1.2, 0.3]}
@@ -50,17 +50,17 @@ class Ledger(System):
 
     account: Account
 
-    def update_contact_history(self, state: Unknowns, indenter: Indenters, new_only: int = 0) -> None:
+    def update_contact_history(self, state: Unknowns, at: Residual, indenter: Indenters, new_only: int = 0) -> None:
         if new_only:
-            return super().update_contact_history(state, indenter, new_only)
+            return super().update_contact_history(state, at, indenter, new_only)
         centre, rotation = indenter.centre.numpy()[0].copy(), indenter.rotation.numpy()[0].copy()
-        force, moment = self.forces(state)[:2]
-        along, whole = self.tangential.numpy()[0], self.traction.numpy()[0]
+        force, moment = self.forces(state, at)[:2]
+        along, whole = at.tangential.numpy()[0], at.traction.numpy()[0]
         about = {"force": force, "moment": moment - np.cross(centre, force), "rubbing": along @ rotation}
         now = SimpleNamespace(centre=centre, rotation=rotation, **about)
         weight = self._faces.weight.numpy()
         anchor, anchored = self.contact.anchor.numpy()[0].copy(), self.contact.anchored.numpy()[0] == 1
-        super().update_contact_history(state, indenter)
+        super().update_contact_history(state, at, indenter)
         moved = self.contact.anchor.numpy()[0] - anchor
         moved[~(anchored & (self.contact.anchored.numpy()[0] == 1))] = 0.0
         account, before = self.account, self.account.last
@@ -194,10 +194,12 @@ def test_window_bears_what_the_indenter_does(element, nu, motion, friction, laye
     stepper = run(posed, mesh)
     body, state = stepper.system, stepper.state
     stepper._place(stepper.at)
-    body.residual(state, stepper.indenter)
-    force, moment = body.forces(state)[:2]
+    residual = body.residual(state, stepper.indenter)
+    force, moment = body.forces(state, residual)[:2]
     rule, material = own_integrals(body.space), pad_material(posed.sensor.gel, mesh)
     check(body.space, state.u, rule.forces(rule.stress(material, state.u, state.p)), force, moment)
     if motion is BESIDE:
-        sideways = body.traction.numpy()[0][(body.space.points[body.space.faces][:, :, 0] == SIZE[0] / 2).all(axis=1)]
+        sideways = residual.traction.numpy()[0][
+            (body.space.points[body.space.faces][:, :, 0] == SIZE[0] / 2).all(axis=1)
+        ]
         assert sideways.any()
