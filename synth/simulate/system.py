@@ -171,7 +171,7 @@ class System:
         return Tangent(values.numpy()[0, :-1], self._unsymmetric(touching.numpy()[0], remainder.numpy()[0]))
 
     def viscous_force(self, before: Unknowns, after: Unknowns, viscosity: float) -> FloatArray:
-        """(k,) force on the free unknowns against a step with a viscosity, see `synth.simulate.newton`."""
+        """(k,) force on the free unknowns against a step with a viscosity, see `synth.simulate.policy.newton`."""
         force = _zeros((1, len(self.space.points)), wp.vec3d)
         (old, _), (new, _) = _on_device(before), _on_device(after)
         thick = _array(np.array([viscosity]), wp.float64)

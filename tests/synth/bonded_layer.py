@@ -22,7 +22,7 @@ from collections.abc import Callable
 from functools import cache, partial
 
 import numpy as np
-from pads import indenters, mapped, scene, supported
+from pads import found_by_newton, indenters, mapped, scene, supported
 from scipy.optimize import brentq
 
 from synth.arrays import BoolArray, FloatArray, Points
@@ -30,7 +30,6 @@ from synth.mesh import PadMesh
 from synth.simulate.contact import Indenters
 from synth.simulate.element import Element
 from synth.simulate.material import uniform
-from synth.simulate.newton import relative_residual, solve
 from synth.simulate.system import System
 
 POINTS = 64  # Gauss points over the contact radius: up to a = 10 h the force keeps 11 digits when they are doubled
@@ -161,8 +160,8 @@ def press(quarter: System, indenter: Indenters, penalties: tuple[float, ...] = (
             quarter.penalty = penalties[k]
         else:
             quarter.augment(residual, indenter)
-        solution = solve(quarter, state, indenter, TOLERANCE)
-        assert solution.converged, f"solve {k}: residual {relative_residual(solution.residual):.1e}"
+        solution = found_by_newton(quarter, state, indenter, TOLERANCE)
+        assert solution.converged, f"solve {k}: residual {solution.relative:.1e}"
         state, residual = solution.state, solution.residual
     return 4 * float(quarter.forces(state, residual)[0][2])
 

@@ -18,10 +18,12 @@ from synth.arrays import FloatArray
 from synth.mesh import PadMesh
 from synth.scene import Scene
 from synth.simulate.contact import Indenters
+from synth.simulate.direct import DirectPress
 from synth.simulate.material import pad_material
+from synth.simulate.options import STANDARD
+from synth.simulate.policy.load_steps import LoadSteps
 from synth.simulate.press import Press
 from synth.simulate.space import Space, function_space
-from synth.simulate.stepping import Stepper
 from synth.simulate.system import Residual, System, Unknowns
 
 PRESS = {"depth_mm": 0.8}
@@ -99,10 +101,12 @@ def account(element: str, steps: int, motion: dict, friction=0.0, layers=False, 
     numerics, material = posed.numerics, pad_material(posed.sensor.gel, mesh)
     ledger = Ledger(function_space(mesh, ELEMENT[element]()), material, penalty=numerics.penalty)
     ledger.account = Account()
-    stepper = Stepper(ledger, Press.of(posed, mesh).path, friction, numerics, E_MPA)
-    ended = stepper.run()
+    path = Press.of(posed, mesh).path
+    steps = LoadSteps(path, SIZE, friction > 0, numerics, STANDARD)
+    press = DirectPress(ledger, path, friction, E_MPA, steps)
+    ended = press.run()
     assert (ended.status, ended.reason) == ("complete", "")
-    ledger.account.stored = own_integrals(ledger.space).energy(material, stepper.state.u, stepper.state.p)
+    ledger.account.stored = own_integrals(ledger.space).energy(material, press.state.u, press.state.p)
     return ledger.account
 
 
@@ -191,10 +195,10 @@ def test_recorded_displacement_and_force_belong_together(element: str, friction:
 def test_window_bears_what_the_indenter_does(element, nu, motion, friction, layers) -> None:
     """With a pressure field, a stiff film, and from the side."""
     posed, mesh = case(element, nu, friction, motion, layers), pad(layers)
-    stepper = run(posed, mesh)
-    body, state = stepper.system, stepper.state
-    stepper._place(stepper.at)
-    residual = body.residual(state, stepper.indenter)
+    press = run(posed, mesh)
+    body, state = press.system, press.state
+    press.place(press.path.length_mm)
+    residual = body.residual(state, press.indenter)
     force, moment = body.forces(state, residual)[:2]
     rule, material = own_integrals(body.space), pad_material(posed.sensor.gel, mesh)
     check(body.space, state.u, rule.forces(rule.stress(material, state.u, state.p)), force, moment)
