@@ -36,8 +36,8 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Kept:
-    """A snapshot: the iterate, what contact remembers, and the factor on the contact stiffness."""
+class Snapshot:
+    """The iterate, what contact remembers, and the factor on the contact stiffness."""
 
     point: Point
     contact: dict[str, np.ndarray]
@@ -62,7 +62,7 @@ class DirectSolver:
         self.system, self.indenter = system, indenter
         self._held = system.space.held.any(axis=1)
         self._direction = system.zero()
-        self._kept: dict[ask.Snapshot, Kept] = {}
+        self._before_pass: Snapshot | None = None
 
     def start(self, state: Unknowns) -> ask.Evaluation:
         """Make a state the iterate."""
@@ -78,16 +78,15 @@ class DirectSolver:
                 self._trial = self._evaluated(self.iterate.state.plus(self._direction, share))
                 error = 0.0 if viscosity is None else self._error(share, viscosity)
                 return replace(self._seen(self._trial), error=error)
-            case ask.Take():
+            case ask.Do.TAKE:
                 self.iterate = self._trial
-            case ask.Keep(snapshot):
-                sharpness = float(self.indenter.sharpness.numpy()[0])
-                self._kept[snapshot] = Kept(self.iterate, self.system.saved_contact(), sharpness)
-            case ask.Restore(snapshot):
-                self._restore(self._kept.pop(snapshot))
-            case ask.Repeat():
-                return self.start(self._kept[ask.Snapshot.PASS].point.state)
-            case ask.Anchor():
+            case ask.Do.KEEP_PASS:
+                self._before_pass = self._snapshot()
+            case ask.Do.RESTORE_PASS:
+                self._restore(self._before_pass)
+            case ask.Do.REPEAT:
+                return self.start(self._before_pass.point.state)
+            case ask.Do.ANCHOR:
                 self._update_history(new_only=1)
         return None
 
@@ -95,7 +94,7 @@ class DirectSolver:
         return Point(state, self.system.residual(state, self.indenter))
 
     def _seen(self, point: Point) -> ask.Evaluation:
-        residual, before = point.residual, self._kept.get(ask.Snapshot.PASS)
+        residual, before = point.residual, self._before_pass
         return ask.Evaluation(
             free=norm(residual.free),
             forces=norm(residual.nodal_forces),
@@ -122,7 +121,10 @@ class DirectSolver:
         missed = norm(trial.residual.free - (1 - share) * iterate.residual.free + thick)
         return missed / max(norm(iterate.residual.free), np.finfo(float).tiny)
 
-    def _restore(self, kept: Kept) -> None:
+    def _snapshot(self) -> Snapshot:
+        return Snapshot(self.iterate, self.system.saved_contact(), float(self.indenter.sharpness.numpy()[0]))
+
+    def _restore(self, kept: Snapshot) -> None:
         self.iterate = kept.point
         self.system.restore_contact(kept.contact)
         self.indenter.sharpness.fill_(kept.sharpness)
@@ -159,7 +161,7 @@ class DirectPress(DirectSolver):
 
         def answer(request: ask.Request) -> Any:
             answer = self.answer(request)
-            if on_progress is not None and isinstance(request, ask.Accept) and self._at > 0:
+            if on_progress is not None and request is ask.Do.ACCEPT and self._at > 0:
                 on_progress(self._at / self.path.length_mm)
             return answer
 
@@ -175,15 +177,18 @@ class DirectPress(DirectSolver):
                 self.indenter.sharpness.fill_(stiffening * self.path.body.sharpness)
                 self.system.augment(self.iterate.residual, self.indenter, share)
                 return self.start(self.iterate.state)
-            case ask.Force():
+            case ask.Do.FORCE:
                 return float(self._forces()[0] @ self.path.direction)
             case ask.Record():
                 self.states.append(self._recorded(request))
-            case ask.Accept():
+            case ask.Do.ACCEPT:
                 self._previous, self.state, self._at = self.state, self.iterate.state, self._target
                 self._update_history(new_only=0)
-            case ask.Restore(ask.Snapshot.STEP):
-                super().answer(request)
+            case ask.Do.KEEP_STEP:
+                self._after_step = self._snapshot()
+            case ask.Do.RESTORE_STEP:
+                self._restore(self._after_step)
+                self._before_pass = None
                 # What follows must not depend on which states were wanted.
                 self.system.forget_factor()
             case _:

@@ -29,7 +29,7 @@ from synth.simulate.load_path import LoadPath
 from synth.simulate.material import Material, uniform
 from synth.simulate.options import SolverOptions
 from synth.simulate.policy import newton
-from synth.simulate.policy.requests import Keep, Snapshot
+from synth.simulate.policy.requests import Do
 from synth.simulate.press import Press
 from synth.simulate.solve import direct_press
 from synth.simulate.space import Space, function_space
@@ -220,7 +220,7 @@ def found_by_newton(
     """Newton's method from a state."""
     solver = DirectSolver(body, indenter)
     at = solver.start(start)
-    solver.answer(Keep(Snapshot.PASS))
+    solver.answer(Do.KEEP_PASS)
     solution = led(newton.solve(at, tolerance, limit, reach_mm), solver.answer)
     last = solver.iterate
     return Found(last.state, last.residual, solution.at.relative, solution.converged, solution.iterations)

@@ -41,7 +41,7 @@ class Scripted:
     asked: list[ask.Request] = field(default_factory=list)
     at_mm: float = 0.0
     seen: ask.Evaluation = GOOD
-    kept: dict[ask.Snapshot, tuple[ask.Evaluation, float]] = field(default_factory=dict)
+    kept: dict[str, tuple[ask.Evaluation, float]] = field(default_factory=dict)
 
     def answer(self, request: ask.Request) -> Any:
         self.asked.append(request)
@@ -56,27 +56,27 @@ class Scripted:
                 free = self.seen.free * (1 - share * (1 - self.falls))
                 self.tried = self.trial(self.at_mm, replace(self.seen, free=free))
                 return self.tried
-            case ask.Take():
+            case ask.Do.TAKE:
                 self.seen = self.tried
-            case ask.Keep(snapshot):
-                self.kept[snapshot] = (self.seen, self.deepest_mm)
-            case ask.Restore(snapshot):
-                self.seen, self.deepest_mm = self.kept[snapshot]
-            case ask.Repeat() | ask.Augment():
+            case ask.Do.KEEP_STEP | ask.Do.KEEP_PASS:
+                self.kept[request.name[5:]] = (self.seen, self.deepest_mm)
+            case ask.Do.RESTORE_STEP | ask.Do.RESTORE_PASS:
+                self.seen, self.deepest_mm = self.kept[request.name[8:]]
+            case ask.Do.REPEAT | ask.Augment():
                 if isinstance(request, ask.Augment):
                     self.deepest_mm *= 1 - request.share / 2
                 self.seen = replace(GOOD, deepest_mm=self.deepest_mm)
                 return self.seen
-            case ask.Force():
+            case ask.Do.FORCE:
                 return self.force
         return None
 
     def kinds(self) -> str:
         """The requests' names in turn."""
-        return " ".join(type(request).__name__ for request in self.asked)
+        return " ".join(r.name if isinstance(r, ask.Do) else type(r).__name__ for r in self.asked)
 
-    def all_of(self, kind: type) -> list[Any]:
-        return [request for request in self.asked if isinstance(request, kind)]
+    def all_of(self, kind: Any) -> list[Any]:
+        return [r for r in self.asked if r is kind or (isinstance(kind, type) and isinstance(r, kind))]
 
 
 def steps(depth_mm: float = 0.3, count: int = 1, frames: frozenset[int] | None = None, **motion: Any) -> LoadSteps:
@@ -102,7 +102,7 @@ def test_newton_takes_full_steps_until_the_tolerance() -> None:
     back_end = Scripted()
     found = solved(back_end)
     assert (found.converged, found.iterations) == (True, 3)  # 0.009 ** 3 is 7e-7
-    assert back_end.kinds() == " ".join(["Solve Try Take"] * 3)
+    assert back_end.kinds() == " ".join(["Solve Try TAKE"] * 3)
     assert [request.iteration for request in back_end.all_of(ask.Solve)] == [0, 1, 2]
 
 
@@ -117,7 +117,7 @@ def test_newton_gives_up_what_stalls_turns_to_nan_has_no_direction_or_inverts() 
     broken = Scripted(trial=lambda at, seen: replace(seen, free=nan))
     assert not solved(broken).converged
     # Below INDIFFERENT the residual does not count, so that the fifth trial is taken and its NaN seen.
-    assert broken.kinds() == "Solve Try Try Try Take"
+    assert broken.kinds() == "Solve Try Try Try TAKE"
     inverted = Scripted(trial=lambda at, seen: replace(seen, smallest_jacobian=-1.0))
     assert not solved(inverted).converged
     assert [request.share for request in inverted.all_of(ask.Try)] == [2.0**-k for k in range(11)]
@@ -145,7 +145,7 @@ def test_relaxation_ends_at_rest_or_where_the_body_has_slipped_off() -> None:
     assert not relaxed(lambda seen: replace(seen, reaction=0.1))[0].converged
     refused, back_end = relaxed(lambda seen: replace(seen, error=inf))
     assert not refused.converged
-    assert not back_end.all_of(ask.Take)
+    assert not back_end.all_of(ask.Do.TAKE)
     assert back_end.all_of(ask.Try)[-1].share == newton.LEAST_SHARE
 
 
@@ -163,13 +163,13 @@ def test_a_press_goes_in_equal_steps_extrapolates_and_records_its_states() -> No
     assert [request.at_mm for request in begun] == pytest.approx([0.0, 0.075, 0.15, 0.225, 0.3])
     assert [request.ratio for request in begun] == pytest.approx([0, 0, 1, 1, 1])
     assert [(record.at_mm, record.iterations) for record in back_end.all_of(ask.Record)] == [(0.15, 2), (0.3, 2)]
-    assert len(back_end.all_of(ask.Accept)) == 5
-    record = "Keep Anchor Record Restore Accept"
-    assert back_end.kinds().endswith(f"Begin Solve Try Take Force {record}")
+    assert len(back_end.all_of(ask.Do.ACCEPT)) == 5
+    record = "KEEP_STEP ANCHOR Record RESTORE_STEP ACCEPT"
+    assert back_end.kinds().endswith(f"Begin Solve Try TAKE FORCE {record}")
     # Where the last state alone is wanted the other is recorded without anchors, as the path goes through it.
     back_end = Scripted(falls=1e-7)
     led(steps(0.3, 2, frozenset({2})).run(), back_end.answer)
-    assert len(back_end.all_of(ask.Anchor)) == 1
+    assert len(back_end.all_of(ask.Do.ANCHOR)) == 1
     assert len(back_end.all_of(ask.Record)) == 2
 
 
@@ -238,8 +238,8 @@ def test_passes_that_fail_are_halved_undone_and_at_last_given_up() -> None:
     assert len(back_end.all_of(ask.Augment)) == multipliers.FAILURES
     (record,) = back_end.all_of(ask.Record)
     assert record.evaluation.deepest_mm == 0.004
-    undone = [request.snapshot for request in back_end.all_of(ask.Restore)]
-    assert undone == [ask.Snapshot.PASS] * 3 + [ask.Snapshot.STEP]
+    assert len(back_end.all_of(ask.Do.RESTORE_PASS)) == 3
+    assert len(back_end.all_of(ask.Do.RESTORE_STEP)) == 1
     # What stays deeper than a fifth of the depth is not recorded.
     back_end = Scripted(falls=1e-7, deepest_mm=0.2)
     back_end.trial = lambda at, seen: replace(seen, free=nan) if back_end.all_of(ask.Augment) else seen
@@ -256,8 +256,8 @@ def test_a_record_that_misses_the_full_tolerance_is_polished_or_its_step_halved(
     assert record.evaluation.relative <= TOLERANCE
     assert record.iterations == 2
     losing = Scripted(falls=1e-4)
-    losing.trial = lambda at, seen: replace(seen, free=nan) if losing.all_of(ask.Keep) and at == 0.1 else seen
+    losing.trial = lambda at, seen: replace(seen, free=nan) if losing.all_of(ask.Do.KEEP_STEP) and at == 0.1 else seen
     policy = steps(0.1)
     assert "did not converge" in led(policy.run(), losing.answer)
     assert not losing.all_of(ask.Record)
-    assert len(losing.all_of(ask.Keep)) == len(losing.all_of(ask.Restore))
+    assert len(losing.all_of(ask.Do.KEEP_STEP)) == len(losing.all_of(ask.Do.RESTORE_STEP))

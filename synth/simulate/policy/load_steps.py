@@ -15,19 +15,7 @@ from synth.simulate.load_path import LoadPath
 from synth.simulate.options import SolverOptions
 from synth.simulate.policy.multipliers import Passes, allowed_share, polish
 from synth.simulate.policy.newton import Solution, relax, solve
-from synth.simulate.policy.requests import (
-    FORCE_FLOOR,
-    Accept,
-    Anchor,
-    Asking,
-    Begin,
-    Evaluation,
-    Force,
-    Keep,
-    Record,
-    Restore,
-    Snapshot,
-)
+from synth.simulate.policy.requests import FORCE_FLOOR, Asking, Begin, Do, Evaluation, Record
 from synth.simulate.trajectory import no_contact, not_converged, too_deep
 
 SHORTEST_STEP = 1 / 128
@@ -85,7 +73,7 @@ class LoadSteps:
         if not self._path.may_touch:
             return ""
         yield Begin(0.0)
-        yield Accept()
+        yield Do.ACCEPT
         while self.next < len(self._waypoints) and not self._reason:
             yield from self._advance()
         return self._reason
@@ -114,7 +102,7 @@ class LoadSteps:
             good = yield from self._record(solution, target)
         if good:
             # After the record, whose passes must still see how far points slipped in this step.
-            yield Accept()
+            yield Do.ACCEPT
             self._lengthen(target, solution.iterations, relaxed)
         else:
             self._shorten(target, relaxed)
@@ -138,7 +126,7 @@ class LoadSteps:
 
         Ends the press, saying so.
         """
-        if target != self._path.press_mm or not self._path.is_over(self._size_mm) or (yield Force()) > FORCE_FLOOR:
+        if target != self._path.press_mm or not self._path.is_over(self._size_mm) or (yield Do.FORCE) > FORCE_FLOOR:
             return False
         self._reason = no_contact(target)
         return True
@@ -148,10 +136,10 @@ class LoadSteps:
 
         Returns whether it does. A state that is too deep is not recorded either, and ends the press, saying so.
         """
-        yield Keep(Snapshot.STEP)
+        yield Do.KEEP_STEP
         solution = step
         if target in self._wanted:
-            yield Anchor()
+            yield Do.ANCHOR
             solution = yield from self._passes.run(step)
             share = allowed_share(self._path.body)
             if solution.converged and solution.at.deepest_mm > share * self._path.depth_scale_mm:
@@ -162,7 +150,7 @@ class LoadSteps:
         if solution.converged and not self._reason:
             yield Record(target, self.iterations, solution.at)
             self.iterations = 0
-        yield Restore(Snapshot.STEP)
+        yield Do.RESTORE_STEP
         return solution.converged
 
     def _lengthen(self, target: float, iterations: int, relaxed: bool) -> None:

@@ -6,7 +6,7 @@ from synth.simulate.distance import KINDS
 from synth.simulate.indenter import RigidBody
 from synth.simulate.load_path import LoadPath
 from synth.simulate.policy.newton import Solution, relax, solve
-from synth.simulate.policy.requests import Asking, Augment, Keep, Repeat, Restore, Snapshot
+from synth.simulate.policy.requests import Asking, Augment, Do
 
 MAX_MULTIPLIER_UPDATES = 2.0
 """Whole updates of the multipliers at a recorded state, in all. Not every contact point of a face on a curved body can
@@ -76,18 +76,18 @@ class Passes:
                 break
             passes += 1
             stiffer = min(2 * stiffening, MAX_STIFFENING) if deep and done > 0 else stiffening
-            yield Keep(Snapshot.PASS)
+            yield Do.KEEP_PASS
             start = yield Augment(share, stiffer)
             tolerance = between if deep or done + share < MAX_MULTIPLIER_UPDATES else self.tolerance
             better = yield from solve(start, tolerance, self.limit, MAX_CORRECTION_RATIO * deepest)
             if not better.converged and deep and share < MAX_RELAXED_UPDATE:
-                start = yield Repeat()
+                start = yield Do.REPEAT
                 better = (yield from relax(start, tolerance)).after(better)
             if better.converged:
                 solution, stiffening, done = better.after(solution), stiffer, done + share
                 share = min(1.0, 2 * share)
             else:
-                yield Restore(Snapshot.PASS)
+                yield Do.RESTORE_PASS
                 solution = solution.after(better)
                 failures, share = failures + 1, share / 2
         return solution

@@ -18,7 +18,7 @@ The pressure has no viscosity, so that the volume is kept throughout. Nothing he
 from dataclasses import dataclass, replace
 from math import inf, isfinite
 
-from synth.simulate.policy.requests import Asking, Evaluation, Solve, Take, Try
+from synth.simulate.policy.requests import Asking, Do, Evaluation, Solve, Try
 
 MAX_ITERATIONS = 20
 NEAR = 1e-2
@@ -78,7 +78,7 @@ def _line_search(before: Evaluation) -> Asking[Evaluation | None]:
         after: Evaluation = yield Try(share)
         falls = after.free <= before.free * (1 - SUFFICIENT_DECREASE * share)
         if after.smallest_jacobian > 0 and (falls or share < INDIFFERENT):
-            yield Take()
+            yield Do.TAKE
             return after
         share /= 2
     return None
@@ -111,7 +111,7 @@ def relax(at: Evaluation, tolerance: float) -> Asking[Solution]:
         iterations += 1
         error = after.error if after.smallest_jacobian > 0 and isfinite(after.error) else inf
         if error <= MAX_ERROR:
-            yield Take()
+            yield Do.TAKE
             at, share = after, 1.0
             if at.reaction < least:
                 break

@@ -1,7 +1,7 @@
 """What the step policy asks of a back end, and what it is answered.
 
 A back end holds a press: its last two accepted states, the iterate of the present solve, a trial beside it, a Newton
-direction, what contact remembers, and snapshots of all that. Requests without a stated answer are answered by None.
+direction, what contact remembers, and snapshots of all that.
 """
 
 from collections.abc import Generator
@@ -45,11 +45,18 @@ class Evaluation:
         return self.free / max(self.forces, FORCE_FLOOR)
 
 
-class Snapshot(Enum):
-    """What a snapshot is for: the end of a load step that is recorded, or the solution before a pass."""
+class Do(Enum):
+    """Requests that need no number. All are answered by None but REPEAT and FORCE."""
 
-    STEP = "step"
-    PASS = "pass"
+    TAKE = "make the trial the iterate"
+    KEEP_STEP = "take a snapshot of the iterate, what contact remembers and its stiffness, at the end of a load step"
+    RESTORE_STEP = "go back to it, whatever was done to record the state"
+    KEEP_PASS = "take a snapshot before a pass"
+    RESTORE_PASS = "go back to it"
+    REPEAT = "go back to its iterate, but not to its multipliers; answered by the Evaluation"
+    ANCHOR = "anchor points that have come to touch, by the iterate, as if the step were accepted"
+    FORCE = "answered by the indenter's force on the gel along the press in the iterate, E mm²: a float"
+    ACCEPT = "make the iterate the last state of the path and let contact's history follow"
 
 
 @dataclass(frozen=True)
@@ -87,35 +94,6 @@ class Try:
 
 
 @dataclass(frozen=True)
-class Take:
-    """Make the trial the iterate."""
-
-
-@dataclass(frozen=True)
-class Keep:
-    """Take a snapshot of the iterate, what contact remembers and its stiffness."""
-
-    snapshot: Snapshot
-
-
-@dataclass(frozen=True)
-class Restore:
-    """Go back to a snapshot."""
-
-    snapshot: Snapshot
-
-
-@dataclass(frozen=True)
-class Repeat:
-    """Go back to the iterate before a pass, but not to its multipliers; answered by its Evaluation."""
-
-
-@dataclass(frozen=True)
-class Anchor:
-    """Anchor points that have come to touch, by the iterate, as if the step were accepted."""
-
-
-@dataclass(frozen=True)
 class Augment:
     """Add a share of the iterate's tractions to the multipliers, with so many times the body's own stiffness.
 
@@ -127,11 +105,6 @@ class Augment:
 
 
 @dataclass(frozen=True)
-class Force:
-    """The indenter's force on the gel along the press, E mm², in the iterate: a float."""
-
-
-@dataclass(frozen=True)
 class Record:
     """Write the iterate down as the state at a path length, with what was seen of it."""
 
@@ -140,12 +113,7 @@ class Record:
     evaluation: Evaluation
 
 
-@dataclass(frozen=True)
-class Accept:
-    """Make the iterate the last state of the path and let contact's history follow."""
-
-
-Request = Begin | Solve | Try | Take | Keep | Restore | Repeat | Anchor | Augment | Force | Record | Accept
+Request = Begin | Solve | Try | Augment | Record | Do
 T = TypeVar("T")
 Asking = Generator[Request, Any, T]
 """A part of the policy, which ends with a T."""
