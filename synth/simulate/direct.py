@@ -62,7 +62,7 @@ class DirectSolver:
         self.system, self.indenter = system, indenter
         self._held = system.space.held.any(axis=1)
         self._direction = system.zero()
-        self._before_pass: Snapshot | None = None
+        self._origin = self._direction
 
     def start(self, state: Unknowns) -> ask.Evaluation:
         """Make a state the iterate."""
@@ -82,6 +82,7 @@ class DirectSolver:
                 self.iterate = self._trial
             case ask.Do.KEEP_PASS:
                 self._before_pass = self._snapshot()
+                self._origin = self.iterate.state
             case ask.Do.RESTORE_PASS:
                 self._restore(self._before_pass)
             case ask.Do.REPEAT:
@@ -94,14 +95,14 @@ class DirectSolver:
         return Point(state, self.system.residual(state, self.indenter))
 
     def _seen(self, point: Point) -> ask.Evaluation:
-        residual, before = point.residual, self._before_pass
+        residual, moved = point.residual, point.state.u - self._origin.u
         return ask.Evaluation(
             free=norm(residual.free),
             forces=norm(residual.nodal_forces),
             reaction=norm(residual.nodal_forces[self._held]),
             smallest_jacobian=residual.smallest_jacobian,
             deepest_mm=residual.deepest,
-            moved_mm=float(np.linalg.norm(point.state.u - before.point.state.u, axis=1).max()) if before else 0.0,
+            moved_mm=float(np.linalg.norm(moved, axis=1).max()),
         )
 
     def _solve(self, wanted: ask.Solve) -> bool:
@@ -188,7 +189,6 @@ class DirectPress(DirectSolver):
                 self._after_step = self._snapshot()
             case ask.Do.RESTORE_STEP:
                 self._restore(self._after_step)
-                self._before_pass = None
                 # What follows must not depend on which states were wanted.
                 self.system.forget_factor()
             case _:
