@@ -3,18 +3,16 @@
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import warp as wp
 
-from synth.arrays import FloatArray
-from synth.simulate.batched import lanes as phases
+from synth.simulate.batched.lane import Lane
+from synth.simulate.batched.lanes import Number
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.presses import press_tables, trajectory
 from synth.simulate.batched.solver import INNER_ITERATIONS, BatchedSolver
 from synth.simulate.options import STANDARD, SolverOptions
-from synth.simulate.policy.newton import MAX_ITERATIONS
+from synth.simulate.policy.load_steps import LoadSteps
 from synth.simulate.press import Press
 from synth.simulate.solve import check_shared
 from synth.simulate.trajectory import Trajectory, at_rest
@@ -23,8 +21,6 @@ MAX_BATCH = 512
 OPTIONS = replace(STANDARD, relaxed_tolerance=0.0, forcing=1e-4, closer=1e-3)
 """The scene's tolerance along the whole load path, because friction remembers the path; linear solves and corrections
 so tight that rounding hardly ever decides which equilibrium is found."""
-CYCLES_PER_POLL = 2
-"""Cycles between looks at which lanes have ended: a lane waits for half of them on average."""
 
 
 def simulate_presses(
@@ -58,11 +54,7 @@ def simulate_presses(
 
 
 class Run:
-    """An iterator over (number of the press, trajectory) in the order in which they end.
-
-    Arguments as of `simulate_presses`, of presses whose indenters touch; `order` are the numbers of the presses in
-    which they begin, by default each once, and `inner` the Krylov iterations of a cycle.
-    """
+    """Presses in the lanes of a solver, in the order given, which is by default theirs."""
 
     def __init__(
         self,
@@ -74,64 +66,64 @@ class Run:
         order: Iterable[int] | None = None,
         inner: int = INNER_ITERATIONS,
     ) -> None:
-        self._presses, self._pad, numerics = presses, pad, presses[0].scene.numerics
-        table, grid = press_tables(presses, frames, pad.device)
-        settings = phases.Settings()
-        settings.tolerance, settings.relaxed_tolerance = numerics.tolerance, options.relaxed_tolerance
-        settings.longest, settings.extrapolate = numerics.max_step_mm, int(options.extrapolate)
-        settings.forcing, settings.closer = options.forcing, options.closer
-        settings.limit, settings.correction_limit = MAX_ITERATIONS, options.correction_iterations
+        self._presses, self._pad, self._frames, self._options = presses, pad, frames, options
+        table, grid = press_tables(presses, pad.device)
         records = max(len(press.path.records()) for press in presses)
-        self.solver = BatchedSolver(pad, table, batch, records, grid, settings, inner)
-        self._order = range(len(presses)) if order is None else order
-        self._graph: Any = None
+        self.solver = BatchedSolver(pad, table, batch, records, grid, inner)
+        self._waiting = iter(range(len(presses)) if order is None else order)
+        self._orders = np.zeros(batch, dtype=np.int32)
+        self._numbers = np.zeros((batch, len(Number)))
+        self.lanes: list[Lane | None] = [None] * batch
         self.cycles = 0
-        self._spent = 0.0
 
     def __iter__(self) -> Iterator[tuple[int, Trajectory]]:
-        """Run all presses. Results are made and handed over while the device works on the next cycles."""
-        batch = self.solver.batch
-        working = np.full(batch, -1)
-        begun = np.zeros(batch)
-        waiting = iter(self._order)
-        empty = np.arange(batch)
-        fetched: list[tuple[int, FloatArray, tuple[int, float, float], float]] = []
+        """Run all presses."""
+        begun = np.zeros(self.solver.batch)
+        spent = 0.0
+        ended = list(range(self.solver.batch))
         while True:
-            assignment = np.full(batch, -1)
-            for lane in empty:
-                working[lane] = assignment[lane] = next(waiting, -2)
             began = time.perf_counter()
-            begun[empty] = self._spent
-            if len(empty):
-                self.solver.fill(assignment)
-            ongoing = bool((working >= 0).any())
-            if ongoing:
-                for _ in range(CYCLES_PER_POLL):
-                    self.advance()
-            self._spent += time.perf_counter() - began  # without what whoever takes the results does meanwhile
-            for number, records, end, seconds in fetched:
-                yield number, trajectory(self._presses[number], records, end, seconds, self._pad.space)
-            if not ongoing:
+            for lane in self._fill(ended):
+                begun[lane] = spent
+            if not any(self.lanes):
                 return
-            began = time.perf_counter()
-            empty = np.flatnonzero(self.solver.lanes.phase.numpy() == phases.ENDED)
-            self._spent += time.perf_counter() - began
-            fetched = [
-                (int(working[s]), records, end, float(self._spent - begun[s]) / batch)
-                for s, records, end in self.solver.ended(empty)
-            ]
+            seen = self.solver.cycle(self._orders, self._numbers).tolist()
+            self.cycles += 1
+            ended = [s for s, lane in enumerate(self.lanes) if lane is not None and lane.ended]
+            over = [(s, lane, self.solver.recorded(s, len(lane.records))) for s in ended if (lane := self.lanes[s])]
+            for s, lane in enumerate(self.lanes):
+                if lane is not None and not lane.ended:
+                    self._orders[s] = lane.advance(seen[s])
+            spent += time.perf_counter() - began  # without what whoever takes the results does meanwhile
+            for s, lane, fields in over:
+                seconds = float(spent - begun[s]) / self.solver.batch
+                press = self._presses[lane.press]
+                yield lane.press, trajectory(press, lane.records, fields, lane.reason, seconds, self._pad.space)
 
-    def advance(self) -> None:
-        """One cycle; on CUDA a graph that is captured the second time, when all kernels are loaded."""
-        self.cycles += 1
-        device = wp.get_device(self._pad.device)
-        if not device.is_cuda or self.cycles == 1:
-            self.solver.cycle()
-            return
-        if self._graph is None:
-            # Relaxed: the garbage collector may free a renderer's memory in this thread meanwhile.
-            mode = wp.CaptureMode.RELAXED
-            with wp.ScopedCapture(device=device, force_module_load=False, capture_mode=mode) as capture:
-                self.solver.cycle()
-            self._graph = capture.graph
-        wp.capture_launch(self._graph)
+    def _fill(self, empty: Sequence[int]) -> Sequence[int]:
+        """Begin presses in empty lanes."""
+        if not empty:
+            return empty
+        assignment = np.full(self.solver.batch, -1)
+        for s in empty:
+            number = next(self._waiting, None)
+            assignment[s], self.lanes[s], self._orders[s] = -2, None, 0
+            if number is not None:
+                lane = Lane(number, self._steps(number), self._numbers[s], self._options.forcing)
+                assignment[s], self.lanes[s], self._orders[s] = number, lane, lane.first
+        self.solver.fill(assignment)
+        return empty
+
+    def _steps(self, number: int) -> LoadSteps:
+        press = self._presses[number]
+        wanted = None if self._frames is None else self._frames[number]
+        scene, mesh = press.scene, press.mesh
+        return LoadSteps(
+            press.path,
+            mesh.size_mm,
+            scene.contact.friction > 0,
+            scene.numerics,
+            self._options,
+            wanted,
+            self._options.closer,
+        )
