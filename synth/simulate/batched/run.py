@@ -80,30 +80,36 @@ class Run:
         """Run all presses."""
         begun = np.zeros(self.solver.batch)
         spent = 0.0
-        ended = list(range(self.solver.batch))
+        empty: Sequence[int] = range(self.solver.batch)
         while True:
             began = time.perf_counter()
-            for lane in self._fill(ended):
-                begun[lane] = spent
+            self._fill(empty)
+            begun[empty] = spent
             if not any(self.lanes):
                 return
-            seen = self.solver.cycle(self._orders, self._numbers).tolist()
-            self.cycles += 1
-            ended = [s for s, lane in enumerate(self.lanes) if lane is not None and lane.ended]
-            over = [(s, lane, self.solver.recorded(s, len(lane.records))) for s in ended if (lane := self.lanes[s])]
-            for s, lane in enumerate(self.lanes):
-                if lane is not None and not lane.ended:
-                    self._orders[s] = lane.advance(seen[s])
+            ended = self.advance()
+            over = [(s, lane, self.solver.recorded(s, len(lane.records))) for s, lane in ended]
             spent += time.perf_counter() - began  # without what whoever takes the results does meanwhile
             for s, lane, fields in over:
                 seconds = float(spent - begun[s]) / self.solver.batch
                 press = self._presses[lane.press]
                 yield lane.press, trajectory(press, lane.records, fields, lane.reason, seconds, self._pad.space)
+            empty = [s for s, _ in ended]
 
-    def _fill(self, empty: Sequence[int]) -> Sequence[int]:
+    def advance(self) -> list[tuple[int, Lane]]:
+        """One cycle, and what the lanes are told to do in the next; the lanes that have ended, with their numbers."""
+        seen = self.solver.cycle(self._orders, self._numbers).tolist()
+        self.cycles += 1
+        working = [(s, lane) for s, lane in enumerate(self.lanes) if lane is not None]
+        ended = [(s, lane) for s, lane in working if lane.ended]
+        for s, lane in working:  # a lane that ends now still has orders for the next cycle
+            self._orders[s] = 0 if lane.ended else lane.advance(seen[s])
+        return ended
+
+    def _fill(self, empty: Sequence[int]) -> None:
         """Begin presses in empty lanes."""
         if not empty:
-            return empty
+            return
         assignment = np.full(self.solver.batch, -1)
         for s in empty:
             number = next(self._waiting, None)
@@ -112,7 +118,6 @@ class Run:
                 lane = Lane(number, self._steps(number), self._numbers[s], self._options.forcing)
                 assignment[s], self.lanes[s], self._orders[s] = number, lane, lane.first
         self.solver.fill(assignment)
-        return empty
 
     def _steps(self, number: int) -> LoadSteps:
         press = self._presses[number]
