@@ -38,9 +38,9 @@ def generate(
         int | None,
         Parameter(
             converter=whole(1),
-            help="Processes that make samples, on one core each; the samples are the same. Default: on a GPU one for "
-            "each core beside this process's, else none: this process makes them and renders on all cores. With the "
-            "batched solver this process simulates, and 1 is for no others.",
+            help="Processes that make samples, on one core each; the samples are the same. Default: one a core as far "
+            "as memory holds them (beside this process, which simulates, on a GPU), or none for a short job. With the "
+            "batched solver 1 is for no others.",
         ),
     ] = None,
     ray: Annotated[
