@@ -39,11 +39,11 @@ from synth.scene import Scene
 from synth.simulate import Trajectory
 from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.footprint import footprint
-from synth.simulate.load_path import path_of
 from synth.simulate.material import pad_material
 from synth.simulate.newton import MAX_ITERATIONS
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.resolution import MARGIN, graded_mesh
+from synth.simulate.scene_path import path_of
 from synth.simulate.space import function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System

@@ -17,9 +17,10 @@ from synth.arrays import FloatArray
 from synth.scene import Numerics
 from synth.simulate.distance import KINDS
 from synth.simulate.indenter import RigidBody
-from synth.simulate.load_path import LoadPath
+from synth.simulate.load_path import TOUCH_MM, LoadPath
 from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relative_residual, relax, solve
 from synth.simulate.options import STANDARD, SolverOptions
+from synth.simulate.posed_path import PosedPath
 from synth.simulate.system import System, Unknowns
 from synth.simulate.tables import pack_indenter, place_indenter
 from synth.simulate.trajectory import State, Trajectory, at_rest, no_contact, not_converged, too_deep
@@ -139,6 +140,8 @@ class Stepper:
             self._place(0.0)
             self.system.residual(self.state, self.indenter)
             self.system.update_contact_history(self.state, self.indenter)
+            if isinstance(self.path, PosedPath) and self.system.deepest() > TOUCH_MM:
+                self.reason = "the object is in the gel in its first pose, in which the gel is at rest"
 
     def _advance(self) -> None:
         """One step."""

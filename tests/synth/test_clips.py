@@ -22,7 +22,7 @@ from synth.dataset.exr import read_channels, write_flow
 from synth.dataset.reader import Dataset, read_dataset
 from synth.dataset.sample_reader import ClipData
 from synth.dataset.shard import Shard
-from synth.dataset.tracks import STATES
+from synth.dataset.tracks import states_columns
 from synth.pipeline.generate import Scheduling, generate
 from synth.planning import job_variant, plan, predict
 from synth.render.renderer import Renderer
@@ -73,7 +73,7 @@ def test_a_clip_is_all_states_of_a_press_each_pictured_once(made: Path, dataset:
         assert set(entry.sha256) == files
         assert (entry.trajectory, entry.frames, clip.meta["frames"]) == (index, (0, 1, 2, 3, 4, 5, 6), [*range(7)])
         assert (len(clip), len(clip.images), len(clip.flows)) == (STEPS + 1, STEPS + 1, STEPS)
-        assert clip.states.dtype.names == STATES
+        assert clip.states.dtype.names == states_columns(clip.meta["scene"])
         assert [*clip.states["frame"]] == [*range(STEPS + 1)]
         np.testing.assert_allclose(clip.states["time_s"], np.arange(STEPS + 1) / 25)
         for axis, name in enumerate(("fx_n", "fy_n", "fz_n")):

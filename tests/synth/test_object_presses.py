@@ -18,10 +18,10 @@ from synth.scene.template import SCENES
 from synth.simulate import indenter, simulate, stepping
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
-from synth.simulate.load_path import path_of
 from synth.simulate.newton import AIM, LEAST_VISCOSITY, MAX_ERROR, MOST_VISCOSITY, Solution, next_viscosity, solve
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.press import Press
+from synth.simulate.scene_path import path_of
 from synth.simulate.solve import simulate_press
 from synth.simulate.trajectory import Trajectory
 
