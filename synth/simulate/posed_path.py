@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from synth.arrays import BoolArray, FloatArray
+from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.mesh.face import face_height
 from synth.scene import Gel, Motion, Vector3
@@ -27,28 +28,9 @@ DEEPEST = 0.85
 """Share of the gel's thickness that no pose may go beyond, as in `synth.scene.Scene`."""
 ROUND_SHARE = 0.1
 """Penetrations on a round gel are measured by this share of its thickness: the depth of a pose says nothing there."""
+IN_GEL = "in the gel in its first pose, in which the gel is at rest"
 NEAR_MM = 1.0
 """What an object may touch is known to such a distance around the gel at rest."""
-
-
-def quaternions(motion: Motion) -> FloatArray:
-    """(k, 4) unit quaternions of a motion by poses, real part last."""
-    found = np.array(motion.poses)[:, 4:]
-    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
-
-
-def touchable_at(motion: Motion, size_mm: Vector3) -> Touchable:
-    """The part of a body that comes near a gel, whose bounding box is of that size, at any of a motion's poses."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z = size_mm
-    corners = np.array([[i * x / 2, j * y / 2, k] for i in (-1, 1) for j in (-1, 1) for k in (-z, z)])
-    turns = Rotation.from_quat(quaternions(motion))
-    there = [
-        turn.inv().apply(corners - place) for turn, place in zip(turns, np.array(motion.poses)[:, 1:4], strict=True)
-    ]
-    every = np.concatenate(there)
-    return Touchable(box=np.array([every.min(axis=0) - NEAR_MM, every.max(axis=0) + NEAR_MM]))
 
 
 @dataclass(frozen=True)
@@ -65,40 +47,28 @@ class PosedPath(LoadPath):
     @cached_property
     def _turns(self) -> FloatArray:
         """(k, 3, 3) of the body's frame."""
-        from scipy.spatial.transform import Rotation
-
-        return np.asarray(Rotation.from_quat(quaternions(self.motion)).as_matrix())
-
-    @cached_property
-    def _turning(self) -> FloatArray:
-        """(k - 1, 3) rotation vectors, rad, from each pose to the next, in the sensor's axes."""
-        from scipy.spatial.transform import Rotation
-
-        return np.asarray(Rotation.from_matrix(self._turns[1:] @ self._turns[:-1].transpose(0, 2, 1)).as_rotvec())
+        return turns_of(self.motion)
 
     @cached_property
     def _moving(self) -> FloatArray:
-        """(k - 1, 6) mm: motion of the body's point over the gel, and the turn times its lever, in each leg."""
+        """(k - 1, 6): in each leg the motion of the body's point over the gel, mm, and the rotation vector, rad."""
         half = np.array([self.gel.size_mm[0] / 2, self.gel.size_mm[1] / 2])
         before = np.column_stack([np.clip(self._places[:-1, :2], -half, half), np.zeros(len(self._places) - 1)])
         turn = self._turns[1:] @ self._turns[:-1].transpose(0, 2, 1)
         after = self._places[1:] + np.einsum("kij,kj->ki", turn, before - self._places[:-1])
-        return np.column_stack([after - before, TWIST_ARM_MM * self._turning])
+        return np.column_stack([after - before, Rotation.from_matrix(turn).as_rotvec()])
 
     @cached_property
     def ends(self) -> FloatArray:
         """(k,) path length at each pose."""
-        length = np.linalg.norm(self._moving[:, :3], axis=1) + np.linalg.norm(self._moving[:, 3:], axis=1)
+        length = np.linalg.norm(self._moving[:, :3], axis=1)
+        length += TWIST_ARM_MM * np.linalg.norm(self._moving[:, 3:], axis=1)
         return np.concatenate([[0.0], np.cumsum(np.maximum(length, PAUSE_MM))])
 
-    @cached_property
-    def _turning_points(self) -> FloatArray:
-        """Path lengths at which the path turns."""
-        along = self._moving / np.diff(self.ends)[:, None]
-        return self.ends[1:-1][np.linalg.norm(np.diff(along, axis=0), axis=1) > TURN]
-
     def turns_between(self, before: float, now: float) -> bool:
-        return bool(np.any((self._turning_points > before) & (self._turning_points <= now)))
+        along = self._moving * ([1.0] * 3 + [TWIST_ARM_MM] * 3) / np.diff(self.ends)[:, None]
+        turns = self.ends[1:-1][np.linalg.norm(np.diff(along, axis=0), axis=1) > TURN]
+        return bool(np.any((turns > before) & (turns <= now)))
 
     @property
     def press_mm(self) -> float:
@@ -111,8 +81,7 @@ class PosedPath(LoadPath):
 
     @cached_property
     def depth_scale_mm(self) -> float:
-        deepest = max(self.pose(float(end)).depth_mm for end in self.ends)
-        return ROUND_SHARE * self.gel.depth_mm if self.gel.is_round else max(deepest, 0.1)
+        return ROUND_SHARE * self.gel.depth_mm if self.gel.is_round else max(self.as_press().depth_mm, 0.1)
 
     def pose(self, s: float) -> Pose:
         """The indenter at path length s, 0 <= s <= length_mm.
@@ -120,12 +89,10 @@ class PosedPath(LoadPath):
         Depth is that of its lowest point below z = 0, shear the way of its origin since the first pose, and twist the
         turn about z that is nearest to its turn since then.
         """
-        from scipy.spatial.transform import Rotation
-
         leg = int(np.clip(np.searchsorted(self.ends, s, side="right") - 1, 0, len(self.ends) - 2))
         share = (s - self.ends[leg]) / (self.ends[leg + 1] - self.ends[leg])
         centre = (1 - share) * self._places[leg] + share * self._places[leg + 1]
-        turn = Rotation.from_rotvec(share * self._turning[leg]).as_matrix() @ self._turns[leg]
+        turn = Rotation.from_rotvec(share * self._moving[leg, 3:]).as_matrix() @ self._turns[leg]
         since = turn @ self._turns[0].T
         twist = float(np.degrees(np.arctan2(since[1, 0] - since[0, 1], since[0, 0] + since[1, 1])))
         x, y, _ = map(float, centre - self._places[0])
@@ -138,31 +105,35 @@ class PosedPath(LoadPath):
     def as_press(self) -> Motion:
         """A press as deep that is dragged as far: what error and time are predicted from."""
         poses = [self.pose(float(end)) for end in self.ends]
-        deep = [pose for pose in poses if pose.depth_mm > 0] or poses[:1]
-        x, y = np.ptp([pose.shear_mm for pose in deep], axis=0)
-        depth = max(pose.depth_mm for pose in deep)
-        return Motion(depth_mm=min(depth, DEEPEST * self.gel.depth_mm), shear_mm=(float(x), float(y)))
+        x, y = np.ptp([pose.shear_mm for pose in poses if pose.depth_mm > 0] or [(0.0, 0.0)], axis=0)
+        return Motion(depth_mm=max(pose.depth_mm for pose in poses), shear_mm=(float(x), float(y)))
 
     def check(self) -> None:
         """InputError, with the line of the file, for a pose that cannot be; of round gels nothing is asked here."""
         if self.gel.is_round:
             return
         x, y = (axis.ravel() for axis in np.meshgrid(*(np.linspace(-s / 2, s / 2, OVER) for s in self.gel.size_mm[:2])))
-        face = np.column_stack([x, y, face_height(np.column_stack([x, y]), self.dome_radius_mm)])
-        deepest = DEEPEST * self.gel.depth_mm
-        if self._inside(face, 0).any():
-            raise InputError(
-                "motion.poses, line 2: the object is in the gel in its first pose, in which the gel is at rest; begin "
-                "before it touches, and give places in mm"
-            )
-        for number in range(len(self._places)):
-            if self._inside(np.column_stack([x, y, np.full(len(x), deepest)]), number).any():
-                raise InputError(
-                    f"motion.poses, line {number + 2}: the object is {deepest:.3g} mm deep or more, which is 85 % of "
-                    f"the gel's thickness ({self.gel.depth_mm} mm)"
+        face, deepest = face_height(np.column_stack([x, y]), self.dome_radius_mm), DEEPEST * self.gel.depth_mm
+        for line, end in enumerate(self.ends, 2):
+            pose = self.pose(float(end))
+            distance = Distance(self.body, pose.centre[None], pose.rotation[None])
+            looked_at = np.column_stack([x, y, face if line == 2 else np.full(len(x), deepest)])
+            if distance(looked_at, np.zeros(len(x), dtype=np.int32))[1].min() < -TOUCH_MM:
+                wrong = (
+                    IN_GEL if line == 2 else f"at least {deepest:.3g} mm, 85 % of the gel's thickness, deep in the gel"
                 )
+                raise InputError(f"motion.poses, line {line}: the object is {wrong}; places are in mm")
 
-    def _inside(self, points: FloatArray, number: int) -> BoolArray:
-        pose = self.pose(float(self.ends[number]))
-        distance = Distance(self.body, pose.centre[None], pose.rotation[None])
-        return np.asarray(distance(points, np.zeros(len(points), dtype=np.int32))[1] < -TOUCH_MM)
+
+def turns_of(motion: Motion) -> FloatArray:
+    """(k, 3, 3) of the body's frame, in a motion by poses."""
+    return np.asarray(Rotation.from_quat(np.array(motion.poses)[:, 4:]).as_matrix())
+
+
+def touchable_at(motion: Motion, size_mm: Vector3) -> Touchable:
+    """The part of a body that comes near a gel, whose bounding box is of that size, at any of a motion's poses."""
+    x, y, z = size_mm
+    corners = np.array([[i * x / 2, j * y / 2, k] for i in (-1, 1) for j in (-1, 1) for k in (-z, z)])
+    away = corners - np.array(motion.poses)[:, None, 1:4]
+    every = (away @ turns_of(motion)).reshape(-1, 3)
+    return Touchable(box=np.array([every.min(axis=0) - NEAR_MM, every.max(axis=0) + NEAR_MM]))

@@ -20,7 +20,7 @@ from synth.simulate.indenter import RigidBody
 from synth.simulate.load_path import TOUCH_MM, LoadPath
 from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relative_residual, relax, solve
 from synth.simulate.options import STANDARD, SolverOptions
-from synth.simulate.posed_path import PosedPath
+from synth.simulate.posed_path import IN_GEL, PosedPath
 from synth.simulate.system import System, Unknowns
 from synth.simulate.tables import pack_indenter, place_indenter
 from synth.simulate.trajectory import State, Trajectory, at_rest, no_contact, not_converged, too_deep
@@ -141,7 +141,7 @@ class Stepper:
             self.system.residual(self.state, self.indenter)
             self.system.update_contact_history(self.state, self.indenter)
             if isinstance(self.path, PosedPath) and self.system.deepest() > TOUCH_MM:
-                self.reason = "the object is in the gel in its first pose, in which the gel is at rest"
+                self.reason = f"the object is {IN_GEL}"
 
     def _advance(self) -> None:
         """One step."""

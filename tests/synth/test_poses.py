@@ -137,7 +137,10 @@ REST = "0,0,0,-4,0,0,0,1\n"
         (HEAD + REST + "1,0,0,-3000,0,0,0,1\n", "line 3: the place .* is farther than 1000 mm off"),
         (HEAD + REST, "line 3: 1 poses; allowed are 2 to 1001"),
         (HEAD + "0,0,0,-3.5,0,0,0,1\n1,0,0,-3,0,0,0,1\n", "line 2: the object is in the gel in its first pose"),
-        (HEAD + REST + "1,0,0,-3.5,0,0,0,1\n2,0,0,-0.9,0,0,0,1\n", r"line 4: the object is 2\.12 mm deep or more"),
+        (
+            HEAD + REST + "1,0,0,-3.5,0,0,0,1\n2,0,0,-0.9,0,0,0,1\n",
+            r"line 4: the object is at least 2\.12 mm.* deep in the gel",
+        ),
     ],
 )
 def test_what_is_no_path_is_refused_with_its_line(text: str, message: str, tmp_path: Path) -> None:
