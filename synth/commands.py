@@ -223,7 +223,9 @@ def export(
     path: Dataset,
     /,
     *,
-    format: Annotated[Literal["flo", "kitti", "npz", "webdataset", "hdf5"], Parameter(help="Layout to write.")],
+    format: Annotated[
+        Literal["flo", "kitti", "npz", "webdataset", "hdf5", "lerobot", "rrd"], Parameter(help="Layout to write.")
+    ],
     out: Annotated[Path, Parameter(help="Directory to write to.")],
     camera: Annotated[str, Parameter(help="Name of a further camera; default: the main one.")] = "",
 ) -> int:
@@ -234,7 +236,7 @@ def export(
 
     with progress("export: samples") as advance:
         count = write_copies(path, format, out, advance, camera)
-    print(f"{count} samples written to {out}; left out: {left_out(path, camera)}")
+    print(f"{count} samples written to {out}; left out: {left_out(path, camera, format)}")
     return 0
 
 

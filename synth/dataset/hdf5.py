@@ -55,7 +55,7 @@ def add_clip(out: Path, clips: dict[str, ClipData]) -> None:
         with h5py.File(out / own, "w") as episode:
             episode.attrs["meta"] = to_document(clip.meta)
             for camera, seen in clips.items():
-                for frame, channels in enumerate(_frames(seen)):
+                for frame, channels in enumerate(frame_channels(seen)):
                     for name, values in channels.items():
                         place = f"tactile/{camera or MAIN}/{name}"
                         if place not in episode:
@@ -71,8 +71,8 @@ def add_clip(out: Path, clips: dict[str, ClipData]) -> None:
         demo.attrs["num_samples"] = frames
         for name in names:
             demo[f"obs/{name}"] = h5py.ExternalLink(own.as_posix(), f"tactile/{MAIN}/{name}")
-        demo["obs/wrench"] = _columns(clip, WRENCH)
-        demo["actions"] = _columns(clip, pose_columns(clip.meta["scene"]))[
+        demo["obs/wrench"] = columns_of(clip, WRENCH)
+        demo["actions"] = columns_of(clip, pose_columns(clip.meta["scene"]))[
             np.minimum(np.arange(frames) + 1, frames - 1)
         ]
         demo["rewards"], demo["dones"] = np.zeros(frames), np.eye(1, frames, frames - 1, dtype=np.int64)[0]
@@ -80,11 +80,11 @@ def add_clip(out: Path, clips: dict[str, ClipData]) -> None:
         data.attrs["env_args"] = json.dumps({"env_name": clip.meta["scene"]["name"], "env_type": 0, "env_kwargs": {}})
 
 
-def _columns(clip: ClipData, names: tuple[str, ...]) -> NDArray[np.float64]:
+def columns_of(clip: ClipData, names: tuple[str, ...]) -> NDArray[np.float64]:
     return np.column_stack([clip.states[name] for name in names])
 
 
-def _frames(clip: ClipData) -> Iterator[dict[str, NDArray[Any]]]:
+def frame_channels(clip: ClipData) -> Iterator[dict[str, NDArray[Any]]]:
     """What is kept of each frame, by name."""
     markers = clip.markers.reshape(-1, len(clip))
     at = np.stack([markers["x"], markers["y"]], axis=-1).swapaxes(0, 1)
