@@ -40,7 +40,6 @@ from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, samples_of, senso
 from synth.scene.template import Template, load_scene, shipped_scenes
 from synth.simulate import Trajectory, simulate
 from synth.simulate.footprint import footprint
-from synth.simulate.load_path import path_of
 from synth.simulate.options import SolverOptions
 from synth.simulate.policy.newton import MAX_ITERATIONS
 from synth.simulate.press import MeshRule
@@ -55,6 +54,7 @@ from synth.simulate.resolution import (
     mesh_levels,
     predicted_error_px,
 )
+from synth.simulate.scene_path import path_of
 
 FINER, BESIDE, STEP_MM = 2.4, (4, 3), 0.125
 """Of the reference: how many times smaller its elements are, elements beside the contact, longest load step."""

@@ -40,12 +40,12 @@ from synth.simulate import Trajectory
 from synth.simulate.direct import DirectPress
 from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.footprint import footprint
-from synth.simulate.load_path import path_of
 from synth.simulate.material import pad_material
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.policy.load_steps import LoadSteps
 from synth.simulate.policy.newton import MAX_ITERATIONS
 from synth.simulate.resolution import MARGIN, graded_mesh
+from synth.simulate.scene_path import path_of
 from synth.simulate.space import function_space
 from synth.simulate.system import System
 

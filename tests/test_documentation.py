@@ -53,7 +53,7 @@ def test_links_lead_to_files_and_tables_are_scenes(page: Path, tmp_path: Path) -
     assert [at for at in re.findall(r"\]\((?!https?:)([^)#]+)", text) if not (page.parent / at).exists()] == []
     base = f'extends = "{"allsight" if page.stem == "round_sensor" else "gelsight_mini"}"\n'
     for table in re.findall(r"```toml\n(.*?)```", text, re.DOTALL):
-        if ".stl" not in table:
+        if ".stl" not in table and ".csv" not in table:
             scene.write_text(table if "extends" in table else base + table)
             synth.plan(scene)
 
@@ -110,7 +110,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_examples_are_short() -> None:
     programs = sorted(EXAMPLES.glob("*.py"))
-    assert len(programs) == 9
+    assert len(programs) == 10
     lines = {program.name: len(program.read_text().splitlines()) for program in programs}
     assert lines.pop("ros2_node.py") <= 60
     assert max(lines.values()) <= 40
@@ -122,6 +122,14 @@ def test_make_clip(tmp_path: Path) -> None:
     assert found(rf"8 frames, at most {NUMBER} N; slides as a whole in [1-7] of them", printed)[0] > 0.3
     assert Image.open(tmp_path / "clip" / "film.webp").n_frames == 8
     assert (tmp_path / "clip" / "states.png").stat().st_size > 10_000
+
+
+def test_make_grasp(tmp_path: Path) -> None:
+    quick = ['numerics={ element = "p1p1", edge_length_mm = 1.0 }', "render.samples_per_pixel=4"]
+    printed = run("make_grasp.py", "--out", tmp_path / "grasp", "--set", *quick)
+    most, last = found(rf"25 frames, at most {NUMBER} N; {NUMBER} N when it is let go", printed)
+    assert most > 1
+    assert last == 0
 
 
 def test_read_exr(dataset: Path) -> None:

@@ -8,7 +8,7 @@
     npz         000000.npz with image1, image2, and the arrays below
     webdataset  shard-000000.tar of at most 512 samples: 000000.{image1.png, image2.png, json}, the latter meta.json,
                 and an .npy of each array below but meta
-    hdf5        of clips, see `synth.dataset.hdf5`; the others are of pairs
+    hdf5        of clips, as are lerobot and rrd: see `synth.dataset.hdf5`, `lerobot` and `rrd`; the others are of pairs
 
 The arrays are forward, forward_visible, backward, backward_visible, the optional channels by their EXR names, force_n
 and torque_nmm (2, 3), per image, and meta, the text of meta.json. In flo and kitti they are in extra/000000.npz. No
@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.arrays import BoolArray
-from synth.dataset.hdf5 import add_clip
+from synth.dataset import hdf5, lerobot, rrd
 from synth.dataset.images import Raster, encode_png
 from synth.dataset.jsontext import to_document
 from synth.dataset.npz import encode_npz
@@ -43,7 +43,8 @@ from synth.dataset.storage import PARTIAL
 from synth.errors import InputError
 from synth.flow.field import FlowArray
 
-ExportFormat = Literal["flo", "kitti", "npz", "webdataset", "hdf5"]
+ExportFormat = Literal["flo", "kitti", "npz", "webdataset", "hdf5", "lerobot", "rrd"]
+OF_CLIPS = {"hdf5": hdf5.add_clip, "lerobot": lerobot.add_clip, "rrd": rrd.add_clip}
 SAMPLES_PER_SHARD = 512
 _UNKNOWN_FLOW = np.float32(1e10)
 _KITTI_SCALE, _KITTI_ZERO = 64.0, 32768.0
@@ -75,10 +76,11 @@ def export(
     dataset = read_dataset(path)
     if not dataset.samples:
         raise InputError(f"{dataset.path}: has no finished sample to export")
-    if dataset.layout.is_of_clips != (format == "hdf5") or not (dataset.layout.has_images or format == "hdf5"):
+    if dataset.layout.is_of_clips != (format in OF_CLIPS) or not (dataset.layout.has_images or format in OF_CLIPS):
         held = "clips" if dataset.layout.is_of_clips else "pairs" if dataset.layout.has_images else "no images"
-        fitting = {"clips": "hdf5", "pairs": "flo, kitti, npz, webdataset"}.get(held, "none; read it in Python")
-        raise InputError(f"{dataset.path}: holds {held}, which --format {format} is not for; allowed: {fitting}")
+        fitting = {"clips": ", ".join(OF_CLIPS), "pairs": "flo, kitti, npz, webdataset"}
+        allowed = fitting.get(held, "none; read it in Python")
+        raise InputError(f"{dataset.path}: holds {held}, which --format {format} is not for; allowed: {allowed}")
     if final.exists() and (not final.is_dir() or any(final.iterdir())):
         raise InputError(f"{final}: exists and is not empty; export never overwrites, give another --out")
     partial = final.with_name(f".{final.name}{PARTIAL}export")
@@ -99,11 +101,11 @@ def export(
     return len(dataset.samples)
 
 
-def left_out(path: Path | str, camera: str = "") -> str:
+def left_out(path: Path | str, camera: str, format: ExportFormat) -> str:
     """What an export of one camera leaves out of a dataset, in words."""
     dataset = read_dataset(path)
     if dataset.layout.is_of_clips:
-        return "surface.npz (the gel's surface, for verify), backward flow"
+        return "surface.npz (the gel's surface, for verify), backward flow" + ", markers.csv" * (format == "lerobot")
     cameras = ["the main camera", *further_cameras(dataset.info["scene"])]
     others = [name for name in cameras if name != (camera or cameras[0])]
     return ", ".join(["surface.npz (the gel's surface, for verify)", *(f"pairs of {name}" for name in others)])
@@ -114,9 +116,9 @@ def _write_all(dataset: Dataset, format: ExportFormat, out: Path, progress: Prog
     if format == "flo":  # torchvision wants two lines at least
         (out / "FlyingChairs_train_val.txt").write_text("1\n" * max(2, len(dataset.samples)))
     total = len(dataset.samples)
-    if format == "hdf5":
+    if format in OF_CLIPS:
         for done, index in enumerate(dataset.samples, 1):
-            add_clip(out, {name: dataset.read_clip(index, name) for name in dataset.layout.cameras})
+            OF_CLIPS[format](out, {name: dataset.read_clip(index, name) for name in dataset.layout.cameras})
             if progress is not None:
                 progress(done, total)
         return

@@ -10,7 +10,7 @@
                    states/fx_n ...                      the columns of states.csv, (frames,)
                    attributes                           meta, the text of meta.json
     dataset.hdf5   data/demo_0/obs/...                  links to left_tactile's of hdf5/0.hdf5, and wrench (frames, 6)
-                              /actions                  (frames, 4) pose in the next frame: depth, shear x and y, twist
+                              /actions                  (frames, 4 or 7) pose in the next frame, as in states
                               /dones, rewards           1 and 0 in the last frame, else 0
 
 References: https://robomimic.github.io/docs/datasets/overview.html; UniVTAC, docs/Collection.md.
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from synth.dataset.jsontext import to_document
 from synth.dataset.sample_reader import ClipData
-from synth.dataset.tracks import POSE, STATES, WRENCH
+from synth.dataset.tracks import WRENCH, pose_columns, states_columns
 from synth.errors import InputError
 
 MAIN = "left_tactile"
@@ -55,7 +55,7 @@ def add_clip(out: Path, clips: dict[str, ClipData]) -> None:
         with h5py.File(out / own, "w") as episode:
             episode.attrs["meta"] = to_document(clip.meta)
             for camera, seen in clips.items():
-                for frame, channels in enumerate(_frames(seen)):
+                for frame, channels in enumerate(frame_channels(seen)):
                     for name, values in channels.items():
                         place = f"tactile/{camera or MAIN}/{name}"
                         if place not in episode:
@@ -64,25 +64,27 @@ def add_clip(out: Path, clips: dict[str, ClipData]) -> None:
                             missing = np.nan if values.dtype.kind == "f" else 0
                             episode.create_dataset(place, shape, values.dtype, fillvalue=missing, **packed)
                         episode[place][frame] = values
-            for name in STATES:
+            for name in states_columns(clip.meta["scene"]):
                 episode[f"states/{name}"] = clip.states[name]
             names = list(episode[f"tactile/{MAIN}"])
         demo = data.create_group(f"demo_{number}")
         demo.attrs["num_samples"] = frames
         for name in names:
             demo[f"obs/{name}"] = h5py.ExternalLink(own.as_posix(), f"tactile/{MAIN}/{name}")
-        demo["obs/wrench"] = _columns(clip, WRENCH)
-        demo["actions"] = _columns(clip, POSE)[np.minimum(np.arange(frames) + 1, frames - 1)]
+        demo["obs/wrench"] = columns_of(clip, WRENCH)
+        demo["actions"] = columns_of(clip, pose_columns(clip.meta["scene"]))[
+            np.minimum(np.arange(frames) + 1, frames - 1)
+        ]
         demo["rewards"], demo["dones"] = np.zeros(frames), np.eye(1, frames, frames - 1, dtype=np.int64)[0]
         data.attrs["total"] = int(data.attrs.get("total", 0)) + frames
         data.attrs["env_args"] = json.dumps({"env_name": clip.meta["scene"]["name"], "env_type": 0, "env_kwargs": {}})
 
 
-def _columns(clip: ClipData, names: tuple[str, ...]) -> NDArray[np.float64]:
+def columns_of(clip: ClipData, names: tuple[str, ...]) -> NDArray[np.float64]:
     return np.column_stack([clip.states[name] for name in names])
 
 
-def _frames(clip: ClipData) -> Iterator[dict[str, NDArray[Any]]]:
+def frame_channels(clip: ClipData) -> Iterator[dict[str, NDArray[Any]]]:
     """What is kept of each frame, by name."""
     markers = clip.markers.reshape(-1, len(clip))
     at = np.stack([markers["x"], markers["y"]], axis=-1).swapaxes(0, 1)

@@ -16,7 +16,7 @@ from synth.dataset.npz import encode_npz
 from synth.dataset.sample import Layout, Sample, largest_motion, sample_name
 from synth.dataset.storage import install_folder, partial_name, storage_errors
 from synth.dataset.store import Output, Store
-from synth.dataset.tracks import MARKERS, MARKERS_FILE, STATES, STATES_FILE, encode_table, states_of
+from synth.dataset.tracks import MARKERS, MARKERS_FILE, STATES_FILE, encode_table, states_columns, states_of
 
 SOLVER_MEANINGS = {
     "solver.slip_ratio": "of the area in contact, the part that slid over the indenter in the last load step, 0 to 1",
@@ -61,9 +61,9 @@ def _write_folder(final: Path, sample: Sample, job: Job, layout: Layout) -> Mani
                 if layout.is_of_clips:
                     (partial / camera / MARKERS_FILE).write_bytes(encode_table(MARKERS, seen.markers))
             if layout.is_of_clips:
-                rate = sample.scene.sampling.frames_per_second
-                rows = states_of(sample.diagnostics["solver"], sample.force_n, sample.torque_nmm, rate)
-                (partial / STATES_FILE).write_bytes(encode_table(STATES, rows))
+                rows = states_of(sample.scene, sample.diagnostics["solver"], sample.force_n, sample.torque_nmm)
+                columns = states_columns(sample.scene.model_dump())
+                (partial / STATES_FILE).write_bytes(encode_table(columns, rows))
             longest = max((motion for motion in motions if motion is not None), default=None)
             (partial / "meta.json").write_bytes(to_document(_meta(sample, job, longest)).encode("utf-8"))
             (partial / "surface.npz").write_bytes(_surface(sample, layout))

@@ -17,7 +17,7 @@ from synth.dataset.images import Raster, read_png
 from synth.dataset.jsontext import read_document
 from synth.dataset.npz import read_npz
 from synth.dataset.sample import CameraPair, Layout, further_cameras
-from synth.dataset.tracks import MARKERS, MARKERS_FILE, STATES, STATES_FILE, read_table
+from synth.dataset.tracks import MARKERS, MARKERS_FILE, STATES_FILE, read_table, states_columns
 from synth.errors import InputError
 from synth.flow.field import FlowArray, FlowField
 from synth.scene import Scene
@@ -126,7 +126,7 @@ class ClipData:
         camera: the camera's name, "" the main one.
         surface: the undeformed contact surface of the gel, mm.
         displacements: of its nodes, for each frame (N, 3) float64, mm.
-        states: a structured array with a row for each frame, of the columns of `synth.dataset.tracks.STATES`.
+        states: a structured array with a row for each frame, of the columns of `synth.dataset.tracks.states_columns`.
         meta: meta.json, with the drawn scene, forces in N and torques in N mm.
     """
 
@@ -208,7 +208,7 @@ def read_clip(folder: Path, camera: str = "") -> ClipData:
         names = ", ".join(layout.cameras[1:]) or "none"
         raise InputError(f"{folder}: has no camera {camera!r}; beside the main camera it has: {names}")
     surface, displacements = _read_surface(folder / "surface.npz", layout)
-    states = read_table(folder / STATES_FILE, STATES)
+    states = read_table(folder / STATES_FILE, states_columns(meta["scene"]))
     if not len(meta["frames"]) == len(states) == len(displacements):
         raise InputError(f"{folder}: meta.json, {STATES_FILE} and surface.npz differ in their numbers of frames")
     return ClipData(folder, camera, surface, displacements, states, meta)

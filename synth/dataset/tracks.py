@@ -4,7 +4,7 @@ Both are CSV with a header, numbers as short as they read back to the same float
 x, y, u and v are px.
 
     frame, time_s          from 0 on
-    depth_mm ... twist_deg the object's pose, as in the scene's [motion]
+    depth_mm ... twist_deg the object's pose, as in the scene's [motion]; or x_mm ... qw, as in motion.poses
     fx_n ... tz_nmm        force and torque of the object on the gel, the scene's frame
     contact_area_mm2       of the deformed contact face
     slip_ratio             of that area, the part that slid in the last load step
@@ -25,27 +25,39 @@ from numpy.typing import NDArray
 
 from synth.arrays import FloatArray
 from synth.errors import InputError
+from synth.scene import Scene
+from synth.scene.pose_file import POSE as POSED
 from synth.untrusted import read_file
 
 STATES_FILE, MARKERS_FILE = "states.csv", "markers.csv"
 POSE = ("depth_mm", "shear_x_mm", "shear_y_mm", "twist_deg")
 WRENCH = ("fx_n", "fy_n", "fz_n", "tx_nmm", "ty_nmm", "tz_nmm")
-STATES = ("frame", "time_s", *POSE, *WRENCH, "contact_area_mm2", "slip_ratio", "gross_slip")
 MARKERS = ("id", "frame", "x", "y", "u", "v", "visible")
 _WHOLE = ("id", "frame", "gross_slip", "visible")
 _GROSS = 1 - 1e-6
 """Slip ratio from which all of the contact slides: areas are sums of weights, which round."""
 
 
+def pose_columns(scene: Mapping[str, Any]) -> tuple[str, ...]:
+    """The columns of the object's pose, of a scene as meta.json has it."""
+    return POSED if scene["motion"].get("poses") else POSE
+
+
+def states_columns(scene: Mapping[str, Any]) -> tuple[str, ...]:
+    """All columns of states.csv."""
+    return ("frame", "time_s", *pose_columns(scene), *WRENCH, "contact_area_mm2", "slip_ratio", "gross_slip")
+
+
 def states_of(
-    solver: Sequence[Mapping[str, Any]], force_n: FloatArray, torque_nmm: FloatArray, frames_per_second: float
+    scene: Scene, solver: Sequence[Mapping[str, Any]], force_n: FloatArray, torque_nmm: FloatArray
 ) -> FloatArray:
     """Rows of states.csv, (frames, columns), from the solver's records and the wrench (frames, 3) of each frame."""
-    rows = []
+    rows, poses = [], scene.motion.poses
     for frame, (state, force, torque) in enumerate(zip(solver, force_n, torque_nmm, strict=True)):
-        pose = (state["depth_mm"], *state["shear_mm"], state["twist_deg"])
+        pressed = (state["depth_mm"], *state["shear_mm"], state["twist_deg"])
+        at = poses[frame] if poses else (frame / scene.sampling.frames_per_second, *pressed)
         area, slip = state["contact_area_mm2"], state["slip_ratio"]
-        rows.append((frame, frame / frames_per_second, *pose, *force, *torque, area, slip, slip >= _GROSS))
+        rows.append((frame, *at, *force, *torque, area, slip, slip >= _GROSS))
     return np.array(rows, np.float64)
 
 

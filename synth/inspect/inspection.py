@@ -12,8 +12,8 @@ from synth.arrays import BoolArray, FloatArray
 from synth.dataset.job import DATASET_FILE
 from synth.dataset.reader import read_dataset
 from synth.dataset.sample import further_cameras
-from synth.dataset.sample_reader import META_FILE, read_meta
-from synth.dataset.tracks import STATES
+from synth.dataset.sample_reader import META_FILE, ClipData, read_meta
+from synth.dataset.tracks import states_columns
 from synth.errors import InputError
 from synth.flow.field import FlowArray
 from synth.inspect.view import View, view_flow, view_sample
@@ -159,8 +159,12 @@ def numbers_of(view: View) -> dict[str, Any]:
         "difference": difference,
         "solver": diagnostics.get("solver"),
         "channels": sorted(flow.extras),
-        "states": None if view.clip is None else {name: view.clip.states[name].tolist() for name in STATES},
+        "states": None if view.clip is None else _columns(view.clip),
     }
+
+
+def _columns(clip: ClipData) -> dict[str, list[float]]:
+    return {name: clip.states[name].tolist() for name in states_columns(clip.meta["scene"])}
 
 
 def _motion(flow: FlowArray, visible: BoolArray, visible_known: bool) -> dict[str, float | None]:

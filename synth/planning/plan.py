@@ -21,6 +21,7 @@ from synth.scene.template import Template, load_scene
 from synth.simulate.indenter import object_triangles, rigid_body
 from synth.simulate.material import DISPLACEMENT_ONLY_BELOW
 from synth.simulate.press import MeshRule
+from synth.simulate.scene_path import path_of
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,8 @@ def check_buildable(template: Template, variant: Variant) -> None:
             gel = corner.sensor.gel
             if isinstance(face := face_of(gel, template.folder), CadFace):
                 face.check(corner.motion, corner.numerics.edge_length_mm or default_edge_length(gel))
+            if corner.motion.poses and corner.contact.indenter.rotation_deg != "any":
+                path_of(corner, template.folder).check()
             is_separated(corner.render, corner.sensor, variant)
             check_pairs(corner)
     except InputError as error:
@@ -118,6 +121,7 @@ def _decisions(template: Template, variant: Variant) -> tuple[Decision, ...]:
     corners = template.corners
     outputs = template.outputs
     depth, friction = [c.motion.depth_mm for c in corners], [c.contact.friction for c in corners]
+    posed = any(c.motion.poses for c in corners)
     poisson = [c.sensor.gel.poisson_ratio for c in corners]
     index, bounces = [c.sensor.window.refractive_index for c in corners], [c.render.max_depth for c in corners]
     mixed = max(poisson) >= DISPLACEMENT_ONLY_BELOW
@@ -144,7 +148,7 @@ def _decisions(template: Template, variant: Variant) -> tuple[Decision, ...]:
     smooth = "" if max(friction) > 0 else ": half the matrix is enough"
     return (
         Decision("pictures", outputs.images, f"outputs.images = {str(outputs.images).lower()}"),
-        Decision("simulation", max(depth) > 0, _span("motion.depth_mm", depth)),
+        Decision("simulation", posed or max(depth) > 0, "motion.poses" if posed else _span("motion.depth_mm", depth)),
         Decision("friction state", max(friction) > 0, _span("contact.friction", friction) + smooth),
         Decision("pressure field", mixed, _span("sensor.gel.poisson_ratio", poisson) + foam),
         Decision("window refraction", max(index) > 1, _span("sensor.window.refractive_index", index)),
@@ -168,11 +172,16 @@ def _batching(template: Template, variant: Variant) -> tuple[bool, str]:
     # Without layers stiffness only scales forces, so that pads which differ in nothing else share a mesh.
     alike = () if template.corners[0].sensor.gel.layers else ("sensor.gel.youngs_modulus_kpa",)
     drawn = [at for _, _, at in template.distributions() if at.startswith("sensor.gel.") and at not in alike]
-    if drawn and (solver == "batched" or variant.is_on_gpu):
+    posed = any(corner.motion.poses for corner in template.corners)
+    if posed and solver == "batched":
+        raise InputError(f'{template.label}: {reason}: it takes no motion.poses; give "single" or "auto"')
+    if posed:
+        reason += ", and motion.poses are simulated one by one"
+    elif drawn and (solver == "batched" or variant.is_on_gpu):
         reason += f": but {', '.join(drawn)} make each sensor's pad another, with a mesh and a batch of its own"
     elif solver == "auto":
         reason += f", and {variant.name} renders"
-    return solver == "batched" or (solver == "auto" and variant.is_on_gpu and not drawn), reason
+    return solver == "batched" or (solver == "auto" and variant.is_on_gpu and not drawn and not posed), reason
 
 
 def _span(name: str, values: Sequence[float]) -> str:

@@ -16,9 +16,9 @@ from synth.mesh.layered import elements_through
 from synth.planning.plan import Plan
 from synth.scene import Gel, MeshIndenter, Scene
 from synth.scene.sampling import draw
-from synth.simulate.load_path import TWIST_ARM_MM, path_of
 from synth.simulate.press import edge_radius_mm
 from synth.simulate.resolution import Resolution, resolution_mm
+from synth.simulate.scene_path import path_of
 from synth.simulate.solve import VICINITY
 
 _Meshes = tuple[list[tuple[Scene, int]], str, tuple[float, float] | None]
@@ -201,10 +201,9 @@ def _order(scene: Scene) -> float:
 
 def _simulation_seconds(scene: Scene, nodes: int, plan: Plan) -> float:
     motion = scene.motion
-    if motion.depth_mm <= 0 and not motion.then:
+    if motion.length_mm == 0:
         return 0.0
-    drag = abs(motion.shear_mm[0]) + abs(motion.shear_mm[1]) + abs(motion.twist_deg) * 0.01745 * TWIST_ARM_MM
-    steps = max((motion.depth_mm + drag) / scene.numerics.max_step_mm, motion.steps)
+    steps = max(motion.length_mm / scene.numerics.max_step_mm, motion.steps)
     iterations = ITERATIONS_PER_STEP * steps + ITERATIONS_PER_RECORD * motion.steps
     if isinstance(scene.contact.indenter, MeshIndenter):
         iterations *= MESH_INDENTER

@@ -88,7 +88,7 @@ class Scene(Part):
                 raise ValueError(
                     f"motion.position_mm {axis} = {x} puts the indenter beside the pad (|{axis}| <= {half})"
                 )
-        for name, pose in motion.poses.items():
+        for name, pose in motion.stops.items():
             if pose.depth_mm > deepest:
                 raise ValueError(
                     f"{name}.depth_mm = {pose.depth_mm} is more than 85 % of the gel's thickness ({gel.depth_mm} mm); "
@@ -143,7 +143,7 @@ class Scene(Part):
         thickness, modulus = self.sensor.gel.depth_mm, self.sensor.gel.youngs_modulus_kpa
         if not 1 <= modulus <= 20_000:
             found.append(f"sensor.gel.youngs_modulus_kpa = {modulus:g}: gels have 10 to 2,000 kPa; check its unit")
-        for name, pose in self.motion.poses.items():
+        for name, pose in self.motion.stops.items():
             given = f"{name}.shear_mm = {list(pose.shear_mm)}"
             if max(map(abs, pose.shear_mm)) > 2 * thickness:
                 found.append(f"{given} is more than twice the gel's thickness ({thickness} mm)")

@@ -25,6 +25,7 @@ from typing import Any
 from synth.errors import InputError
 from synth.scene import Numerics, Outputs, Sampling, Scene
 from synth.scene.gel_file import measured
+from synth.scene.pose_file import with_poses
 from synth.scene.validation import DISTRIBUTIONS, validated
 from synth.untrusted import DEEPEST, MOST_FOLDERS, assigned_value, matching_files, open_file, read_toml
 
@@ -35,7 +36,7 @@ FIXED = ("name", "description", "references", "numerics", "outputs", "sampling")
 """Parts that all samples of a dataset share."""
 MOST_OPTIONS = 10_000
 """Of all choices of a scene: each is checked when the scene is loaded."""
-FILES = ("file", "outer", "window", "rest_map", "flat_field")
+FILES = ("file", "outer", "window", "rest_map", "flat_field", "poses")
 """Keys under which names of files stand."""
 
 _Turns = dict[int, list[tuple[Any, int]]]
@@ -155,7 +156,7 @@ def checked_template(content: dict[str, Any], source: Path, changed: tuple[str, 
     """A template whose distributions, corners and mesh files have been checked; InputError says what is wrong."""
     template = Template(content, source, changed)
     try:
-        template = replace(template, content=measured(content, source.parent))
+        template = replace(template, content=with_poses(measured(content, source.parent), source.parent))
     except ValueError as error:
         raise InputError(f"{template.label}: sensor.gel: {error}") from None
     for kind, arguments, where in template.distributions():
@@ -228,11 +229,11 @@ def _read(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
 
 
 def _extended(below: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
-    """A table over another: tables within it alike, but one that says its kind (or shape) replaces that below it."""
+    """A table over another: tables within it alike, but one that says its kind, shape or poses replaces it."""
     both = dict(below)
     for key, value in content.items():
         tables = all(isinstance(each, dict) and not _is_distribution(each) for each in (value, below.get(key)))
-        replaces = not tables or ("kind" if "kind" in below[key] else "shape") in value
+        replaces = not tables or "poses" in value or ("kind" if "kind" in below[key] else "shape") in value
         both[key] = value if replaces else _extended(below[key], value)
     return both
 

@@ -45,7 +45,7 @@ def face_error(scene: Scene, focus: Focus, spacing_mm: float) -> float:
     `spacing_mm` is the size of the elements under the contact, as `synth.simulate.resolution` has it.
     """
     motion, indenter = scene.motion, scene.contact.indenter
-    poses = motion.poses.values()
+    poses = motion.stops.values()
     depth = max(pose.depth_mm for pose in poses)
     if depth <= 0:
         return 0.0

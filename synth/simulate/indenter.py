@@ -4,7 +4,7 @@ Frame of an indenter: its own +z points at the gel. Balls, bars, blocks and ring
 cone at the centre of its rounded tip, a mesh at the centre of its bounding box.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -45,19 +45,23 @@ CELLS_PER_RADIUS = 2.5
 
 @dataclass(frozen=True)
 class Touchable:
-    """The part of a body that a gel can touch in a press of a depth.
+    """The part of a body that a gel can touch in a press of a depth, or within a box.
 
     The radius is about the body's axis along z, through its origin; the height is from its lowest point, the one that
     is nearest to the gel. On a round gel, which recedes beside the place, that point comes down `at_tip`: on the axis.
+    A box, (2, 3) lower and upper corner in the body's axes, says that poses are of the body's own frame: the origin of
+    a mesh is its file's.
     """
 
     radius_mm: float = np.inf
     height_mm: float = np.inf
     depth_mm: float = np.inf
     at_tip: bool = False
+    box: FloatArray | None = None
 
 
 EVERYTHING = Touchable()
+KIND_NAMES = {number: name for name, number in KINDS.items()}
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,7 @@ class RigidBody:
         sharpest_mm: its smallest radius of curvature: fillet, tip, tube or, of a mesh, the cell of its grid.
         fillet_mm: radius that its edges have; 0 for shapes without edges.
         lost_mm: how far a mesh's surface is moved by rounding, at most, within the depth of the press.
+        corners: (k, 3) vertices of a mesh's convex hull; none of other shapes.
     """
 
     kind: int
@@ -83,6 +88,27 @@ class RigidBody:
     sharpest_mm: float
     fillet_mm: float = 0.0
     lost_mm: float = 0.0
+    corners: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def reach_along(self, direction: FloatArray) -> float:
+        """How far it extends from its origin along a direction (3,), a unit vector in its axes: its support function.
+
+        A mesh with its edges as sharp as its file has them.
+        """
+        radial, axial = float(np.hypot(direction[0], direction[1])), float(direction[2])
+        rounding, *lengths = map(float, self.shape)
+        match KIND_NAMES[self.kind]:
+            case "sphere":
+                return lengths[0]
+            case "cylinder":
+                return lengths[0] * radial + lengths[1] * abs(axial) + rounding
+            case "box":
+                return float(np.abs(direction) @ lengths[:3]) + rounding
+            case "cone":
+                return max(0.0, lengths[0] * radial - lengths[1] * axial) + rounding
+            case "torus":
+                return lengths[0] * radial + rounding
+        return float((self.corners @ direction).max())
 
     @property
     def sharpness(self) -> float:
@@ -116,32 +142,29 @@ def rigid_body(
     if isinstance(indenter, MeshIndenter):
         return _object(indenter, folder or Path(), resolution_mm, touchable)
     rotation = turned_by(indenter.rotation_deg)
-    up = rotation.T @ np.array([0.0, 0.0, 1.0])
-    radial, axial = float(np.hypot(up[0], up[1])), float(up[2])
     fillet = 0.0
     match indenter:
         case Sphere(radius_mm=radius):
-            lengths, reach, sharpest = [0.0, radius], radius, radius
+            lengths, sharpest = [0.0, radius], radius
         case Cylinder(radius_mm=radius, length_mm=length):
             fillet = sharpest = _fillet(indenter, resolution_mm, min(radius, length / 2))
             core, half = radius - fillet, length / 2 - fillet
-            lengths, reach = [fillet, core, half], core * radial + half * abs(axial) + fillet
+            lengths = [fillet, core, half]
         case Box(size_mm=size):
             fillet = sharpest = _fillet(indenter, resolution_mm, min(size) / 2)
-            half_edges = np.array(size) / 2 - fillet
-            lengths, reach = [fillet, *half_edges], float(np.abs(up) @ half_edges) + fillet
+            lengths = [fillet, *(np.array(size) / 2 - fillet)]
         case Cone(half_angle_deg=angle, height_mm=height):
             fillet = sharpest = _fillet(indenter, resolution_mm, height / 2)
             core = height - 2 * fillet
-            base = core * float(np.tan(np.radians(angle)))
-            lengths, reach = [fillet, base, core], max(0.0, base * radial - core * axial) + fillet
+            lengths = [fillet, core * float(np.tan(np.radians(angle))), core]
         case Torus(radius_mm=radius, tube_mm=tube):
             _require(tube < radius, indenter, "tube_mm", f"less than radius_mm = {radius}")
-            lengths, reach, sharpest = [tube, radius], radius * radial + tube, tube
+            lengths, sharpest = [tube, radius], tube
     shape = np.zeros(SHAPE_LENGTH)
     shape[: len(lengths)] = lengths
     shape[5:] = rotation.T @ (rotation @ indenter.offset_mm * [1, 1, 0])
-    return RigidBody(KINDS[indenter.shape], shape, rotation, reach, np.zeros((1, 1, 1)), sharpest, fillet)
+    body = RigidBody(KINDS[indenter.shape], shape, rotation, 0.0, np.zeros((1, 1, 1)), sharpest, fillet)
+    return replace(body, reach_mm=body.reach_along(rotation[2]))
 
 
 def _fillet(indenter: Cylinder | Box | Cone, resolution: float, half_thickness: float) -> float:
@@ -163,6 +186,7 @@ def _require(holds: bool, indenter: Indenter, field: str, allowed: str) -> None:
 def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchable: Touchable) -> RigidBody:
     """A triangle mesh. It is turned before it is sampled, so that the grid holds the part that touches alone."""
     from scipy.ndimage import spline_filter
+    from scipy.spatial import ConvexHull
 
     surface, origin = object_triangles(indenter, folder)
     if indenter.rotation_deg == "any":
@@ -171,14 +195,16 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
     turned = replace(surface, points=np.asarray(surface.points @ rotation.T))
     radius = object_radius(indenter, resolution_mm)
     lowest = turned.points.max(axis=0)[2]
-    match indenter.offset_mm or ("lowest" if touchable.at_tip else (0.0, 0.0, 0.0)):
+    posed = touchable.box is not None
+    match indenter.offset_mm or ("origin" if posed else "lowest" if touchable.at_tip else (0.0, 0.0, 0.0)):
         case "lowest":
             place = turned.points[turned.points[:, 2] > lowest - TIP_MM].mean(axis=0)
         case "origin":
             place = rotation @ origin
         case offset:
             place = rotation @ np.multiply(offset, [1, -1, 1])
-    turned = replace(turned, points=turned.points - place * [1, 1, 0])
+    turned = replace(turned, points=turned.points - place * [1, 1, int(posed)])
+    lowest = turned.points.max(axis=0)[2]
     grid = _grid_over(turned, indenter, radius, touchable)
     sharp, values = _rounded_distance(turned, grid, radius, f"contact.indenter.file = {indenter.file!r}")
     shape = np.array([0.0, *grid.corner, grid.spacing, *grid.counts])
@@ -189,8 +215,12 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
     reach = lowest - max(kept * (lowest - reach), lowest - reach - MOST_RAISED * touchable.depth_mm)
     corners = turned.points[turned.points[:, 2] >= lowest - touchable.depth_mm]
     corners = corners[np.abs(grid.at(corners, sharp)) < grid.spacing]  # not those of walls within the solid
+    if touchable.box is not None:
+        corners = corners[((corners >= touchable.box[0]) & (corners <= touchable.box[1])).all(axis=1)]
     lost = float(np.abs(grid.at(corners, values)).max(initial=0.0))
-    return RigidBody(KINDS["mesh"], shape, np.eye(3), reach, coefficients, max(radius, grid.spacing), radius, lost)
+    hull = turned.points[ConvexHull(turned.points).vertices]
+    sharpest = max(radius, grid.spacing)
+    return RigidBody(KINDS["mesh"], shape, np.eye(3), reach, coefficients, sharpest, radius, lost, hull)
 
 
 def _grid_over(turned: Triangles, indenter: MeshIndenter, radius: float, touchable: Touchable) -> Grid:
@@ -198,6 +228,10 @@ def _grid_over(turned: Triangles, indenter: MeshIndenter, radius: float, touchab
     low, high = turned.points.min(axis=0), turned.points.max(axis=0)
     low = np.maximum(low, [-touchable.radius_mm, -touchable.radius_mm, high[2] - touchable.height_mm])
     high = np.minimum(high, [touchable.radius_mm, touchable.radius_mm, np.inf])
+    if touchable.box is not None:
+        low, high = np.maximum(low, touchable.box[0]), np.minimum(high, touchable.box[1])
+        if (low >= high).any():
+            raise InputError(f"motion.poses: {indenter.file} never comes near the gel: are places and object in mm?")
     spacing = indenter.cell_mm or _spacing(radius, high - low, indenter.fillet_mm is not None)
     if indenter.fillet_mm is not None and spacing > radius:
         raise InputError(

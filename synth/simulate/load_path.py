@@ -19,22 +19,18 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
-from pathlib import Path
 
 import numpy as np
 
 from synth.arrays import FloatArray
 from synth.mesh.cad import CadFace
-from synth.mesh.face import PadFace, RoundFace, face_height, face_of
-from synth.scene import Motion, Scene
+from synth.mesh.face import RoundFace, face_height
+from synth.scene import Motion
+from synth.scene.motion import TWIST_ARM_MM
 from synth.simulate.distance import KINDS
-from synth.simulate.indenter import RigidBody, Touchable, rigid_body, rotation_about
+from synth.simulate.indenter import RigidBody, rotation_about
 from synth.simulate.measure import Distance
 
-TWIST_ARM_MM = 3.0
-"""Lever that turns a twist angle into a path length: about a contact's radius."""
-BULGE, SLACK_MM = 1.5, 1.0
-"""Gel beside a contact rises toward the body: no higher than this share of the depth, and so much."""
 TOUCH_MM = 1e-6
 """The path starts so far off the gel, at most."""
 OVER = 65
@@ -163,7 +159,7 @@ class LoadPath:
         motion = self.motion
         start = min(motion.depth_mm, self.touch_mm)
         poses = [(start, 0.0, 0.0, 0.0), (motion.depth_mm, 0.0, 0.0, 0.0)]
-        poses += [(pose.depth_mm, *pose.shear_mm, pose.twist_deg) for pose in motion.poses.values()]
+        poses += [(pose.depth_mm, *pose.shear_mm, pose.twist_deg) for pose in motion.stops.values()]
         return np.array([pose for pose, _ in groupby(poses)])
 
     @cached_property
@@ -216,26 +212,9 @@ class LoadPath:
         stops = np.unique(np.concatenate([self.records(), self.ends]))
         return stops[stops > 0]
 
+    def check(self) -> None:
+        """InputError for a path that cannot be; what a motion says has been checked with the scene."""
+
     def turns_between(self, before: float, now: float) -> bool:
         """Whether the path turns after `before` and not after `now`, so that extrapolation across is meaningless."""
         return bool(np.any((self.ends > before) & (self.ends <= now)))
-
-
-def path_of(scene: Scene, folder: Path | None = None, resolution_mm: float = 0.0) -> LoadPath:
-    """The load path of a fully drawn scene's indenter, whose mesh file is relative to `folder`.
-
-    `resolution_mm` is the smallest radius that the gel's mesh resolves, see `rigid_body`. InputError where the indenter
-    cannot be built.
-    """
-    motion, gel = scene.motion, scene.sensor.gel
-    poses = motion.poses.values()
-    aside = max(float(np.hypot(*np.add(motion.position_mm, pose.shear_mm))) for pose in poses)
-    face = face_of(gel, folder or Path())
-    frame = None if isinstance(face, PadFace) else PressFrame.of(motion, face)
-    lowest = -frame.start_mm if frame else gel.face_mm(*motion.position_mm)
-    deepest = max(pose.depth_mm for pose in poses) + lowest
-    height = BULGE * max(deepest, 0.0) + SLACK_MM
-    at_tip = gel.shape == "capsule" or (motion.polar_deg, motion.height_mm) != (None, None)
-    touchable = Touchable(float(np.hypot(*gel.size_mm[:2])) / 2 + aside, height, max(motion.depth_mm, 0.0), at_tip)
-    body = rigid_body(scene.contact.indenter, folder, resolution_mm, touchable)
-    return LoadPath(motion, body, gel.dome_radius_mm, frame)

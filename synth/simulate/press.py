@@ -10,7 +10,7 @@ from synth.mesh import PadMesh, default_edge_length, pad_mesh
 from synth.scene import MeshIndenter, Scene
 from synth.scene.numerics import MAX_PENALTY
 from synth.simulate.indenter import RigidBody, object_radius
-from synth.simulate.load_path import LoadPath, path_of
+from synth.simulate.load_path import LoadPath
 from synth.simulate.resolution import (
     FINER,
     Accuracy,
@@ -22,6 +22,7 @@ from synth.simulate.resolution import (
     shared_mesh,
     shared_spacing_mm,
 )
+from synth.simulate.scene_path import path_of
 
 BLUNTER = ((1.5, 1.0), (1.5, 2.0), (2.25, 4.0), (1.8, 3.0), (1.0, 2.0))
 """Factors on the radius of an object's edges and on the contact stiffness, in turn, where its press is incomplete.

@@ -27,7 +27,8 @@ from synth.scene import Gel, MeshIndenter, Numerics, Scene
 from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.error_model import face_error
 from synth.simulate.footprint import footprint
-from synth.simulate.load_path import path_of
+from synth.simulate.posed_path import PosedPath
+from synth.simulate.scene_path import path_of
 
 ELEMENTS_ACROSS = (4, 6, 8, 10, 12, 14, 16)
 """Elements across the contact to choose from."""
@@ -195,12 +196,19 @@ def resolution_mm(scene: Scene, spacing_mm: float) -> float:
     return spacing_mm / (2 * ELEMENTS[scene.numerics.element]().order)
 
 
-def _focus(scene: Scene, folder: Path | None) -> Focus:
-    """Where the indenter will touch; a mesh with its edges as sharp as its file has them, which takes less time."""
+def _focus(scene: Scene, folder: Path | None) -> tuple[Focus, Scene]:
+    """Where the indenter will touch, and the scene with a press in place of poses.
+
+    A mesh is taken with its edges as sharp as its file has them, which takes less time.
+    """
+    whole = scene
     if isinstance(scene.contact.indenter, MeshIndenter):
         sharp = scene.contact.indenter.model_copy(update={"fillet_mm": None})
         scene = scene.model_copy(update={"contact": scene.contact.model_copy(update={"indenter": sharp})})
-    return footprint(path_of(scene, folder), scene.sensor.gel.size_mm, MARGIN)
+    path = path_of(scene, folder)
+    if isinstance(path, PosedPath):
+        whole = whole.model_copy(update={"motion": path.as_press()})
+    return footprint(path, scene.sensor.gel.size_mm, MARGIN), whole
 
 
 def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolution:
@@ -211,7 +219,7 @@ def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolu
     built.
     """
     gel = scene.sensor.gel
-    focus = _focus(scene, folder)
+    focus, scene = _focus(scene, folder)
     stated = getattr(scene.contact.indenter, "fillet_mm", None)
     least = CONTACT_ACROSS if scene.outputs.contact or scene.outputs.slip else 0
     usual = mesh_levels(gel, focus)
@@ -260,6 +268,6 @@ def shared_spacing_mm(gel: Gel, numerics: Numerics) -> float:
 def accuracy(scene: Scene, folder: Path | None = None) -> Accuracy:
     """What the shared mesh gives for one instance; InputError where the indenter cannot be built."""
     gel, numerics = scene.sensor.gel, scene.numerics
-    focus = _focus(scene, folder)
+    focus, scene = _focus(scene, folder)
     error = predicted_error_px(scene, focus, shared_spacing_mm(gel, numerics))
     return Accuracy(int(2 * min(focus.half_mm) / _width(gel.size_mm, numerics.cells)), error)

@@ -17,9 +17,9 @@ from synth.scene.sampling import draw, samples_of
 from synth.scene.template import load_scene
 from synth.simulate import simulate
 from synth.simulate.footprint import footprint
-from synth.simulate.load_path import path_of
 from synth.simulate.press import MeshRule
 from synth.simulate.resolution import MARGIN, graded_mesh, scale_px_per_mm
+from synth.simulate.scene_path import path_of
 
 TINY = """
 name = "tiny"

@@ -36,8 +36,8 @@ from synth.scene.part import Vector3
 from synth.scene.template import load_scene
 from synth.simulate import Trajectory
 from synth.simulate.element import p2p1
-from synth.simulate.load_path import path_of
 from synth.simulate.press import MeshRule
+from synth.simulate.scene_path import path_of
 from synth.simulate.space import function_space
 from synth.surface import GelSurface
 from synth.verify.dataset import verify_dataset

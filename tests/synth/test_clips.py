@@ -22,7 +22,7 @@ from synth.dataset.exr import read_channels, write_flow
 from synth.dataset.reader import Dataset, read_dataset
 from synth.dataset.sample_reader import ClipData
 from synth.dataset.shard import Shard
-from synth.dataset.tracks import STATES
+from synth.dataset.tracks import states_columns
 from synth.pipeline.generate import Scheduling, generate
 from synth.planning import job_variant, plan, predict
 from synth.render.renderer import Renderer
@@ -73,7 +73,7 @@ def test_a_clip_is_all_states_of_a_press_each_pictured_once(made: Path, dataset:
         assert set(entry.sha256) == files
         assert (entry.trajectory, entry.frames, clip.meta["frames"]) == (index, (0, 1, 2, 3, 4, 5, 6), [*range(7)])
         assert (len(clip), len(clip.images), len(clip.flows)) == (STEPS + 1, STEPS + 1, STEPS)
-        assert clip.states.dtype.names == STATES
+        assert clip.states.dtype.names == states_columns(clip.meta["scene"])
         assert [*clip.states["frame"]] == [*range(STEPS + 1)]
         np.testing.assert_allclose(clip.states["time_s"], np.arange(STEPS + 1) / 25)
         for axis, name in enumerate(("fx_n", "fy_n", "fz_n")):
@@ -324,7 +324,72 @@ def test_clips_as_hdf5_hold_what_the_clips_hold(made: Path, dataset: Dataset, tm
     export(made, "hdf5", tmp_path / "again")
     for name in ("dataset.hdf5", "hdf5/2.hdf5"):
         assert (tmp_path / "o" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
-    refused("holds clips, which --format flo is not for; allowed: hdf5", export, made, "flo", tmp_path / "flo")
+    refused(
+        "holds clips, which --format flo is not for; allowed: hdf5, lerobot, rrd", export, made, "flo", tmp_path / "flo"
+    )
+
+
+def test_clips_as_a_lerobot_dataset_are_tables_of_frames(made: Path, dataset: Dataset, tmp_path: Path, capsys) -> None:
+    pq = pytest.importorskip("pyarrow.parquet")
+    command = ("export", made, "--format", "lerobot", "--out", tmp_path / "o")
+    assert "markers.csv" in said(capsys, main, *command)
+    info = json.loads((tmp_path / "o" / "meta" / "info.json").read_text())
+    assert (info["total_episodes"], info["total_frames"], info["fps"]) == (3, 3 * (STEPS + 1), 25)
+    rows = [
+        row for k in range(3) for row in pq.read_table(tmp_path / f"o/data/chunk-000/file-{k:03d}.parquet").to_pylist()
+    ]
+    assert set(rows[0]) == set(info["features"])
+    assert [row["index"] for row in rows] == [*range(3 * (STEPS + 1))]
+    for number, clip in enumerate(dataset):
+        for frame, row in enumerate(rows[number * (STEPS + 1) : (number + 1) * (STEPS + 1)]):
+            image = np.asarray(Image.open(io.BytesIO(row["observation.images.tactile"]["bytes"])))
+            np.testing.assert_array_equal(image, clip.images[frame])
+            assert row["observation.wrench"][2] == clip.states["fz_n"][frame]
+            assert row["action"][1] == clip.states["shear_x_mm"][min(frame + 1, STEPS)]
+            if frame:
+                np.testing.assert_array_equal(np.float32(row["tactile.flow"]), clip.flows[frame - 1].forward)
+                np.testing.assert_array_equal(row["tactile.slip.Y"], clip.flows[frame - 1].extras["slip.Y"])
+    stats = json.loads((tmp_path / "o" / "meta" / "stats.json").read_text())
+    wrench = np.array([row["observation.wrench"] for row in rows])
+    for name in ("min", "max", "mean", "std"):  # of three clips, one after the other
+        np.testing.assert_allclose(stats["observation.wrench"][name], getattr(wrench, name)(axis=0), rtol=1e-9)
+    pictures = np.array([clip.images[frame] for clip in dataset for frame in range(STEPS + 1)]) / 255
+    np.testing.assert_allclose(np.ravel(stats["observation.images.tactile"]["std"]), pictures.std(axis=(0, 1, 2)))
+
+
+@pytest.mark.slow
+def test_lerobots_own_loader_reads_the_clips(made: Path, dataset: Dataset, tmp_path: Path) -> None:
+    lerobot = pytest.importorskip("lerobot.datasets.lerobot_dataset")
+    export(made, "lerobot", tmp_path / "o")
+    loaded = lerobot.LeRobotDataset("clips", root=tmp_path / "o", delta_timestamps={"action": [0.0, 0.04]})
+    assert (len(loaded), loaded.num_episodes) == (3 * (STEPS + 1), 3)
+    clip, item = dataset.read_clip(1), loaded[STEPS + 1 + 4]
+    # Pictures are float32 in [0, 1], rounded by one division.
+    picture = np.moveaxis(item["observation.images.tactile"].numpy(), 0, -1) * 255
+    np.testing.assert_allclose(picture, clip.images[4], atol=1e-4)
+    np.testing.assert_array_equal(item["tactile.flow"].numpy(), clip.flows[3].forward)
+    np.testing.assert_allclose(item["action"][:, 1], clip.states["shear_x_mm"][5:7], rtol=1e-6)
+    assert (item["task"], int(item["frame_index"]), int(item["episode_index"])) == ("tiny", 4, 1)
+
+
+def test_clips_as_recordings_hold_pictures_flow_markers_and_wrench(made: Path, dataset: Dataset, tmp_path) -> None:
+    chunk = pytest.importorskip("rerun.chunk")
+    export(made, "rrd", tmp_path / "o")
+    assert sorted(file.name for file in (tmp_path / "o").iterdir()) == [f"00000{k}.rrd" for k in range(3)]
+    columns: dict[str, list] = {}
+    for part in chunk.RrdReader(tmp_path / "o" / "000002.rrd").stream():
+        for name, values in part.to_record_batch().to_pydict().items():
+            columns.setdefault(f"{part.entity_path} {name}", []).extend(values)
+    clip = dataset.read_clip(2)
+    assert columns["/force_n frame"] == [*range(STEPS + 1)]
+    assert [row[2] for row in columns["/force_n Scalars:scalars"]] == clip.states["fz_n"].tolist()
+    assert [time.total_seconds() for time in columns["/slip_ratio time"]] == clip.states["time_s"].tolist()
+    assert bytes(columns["/tactile Image:buffer"][3][0]) == clip.images[3].tobytes()
+    marks = clip.markers[clip.markers["frame"] == 4]
+    expected = np.column_stack([marks["x"], marks["y"]]).astype(np.float32)
+    np.testing.assert_array_equal(columns["/tactile/markers Points2D:positions"][4], expected)
+    for name in ("/tactile/flow", "/tactile/slip.Y", "/tactile/motion"):
+        assert len(columns[f"{name} frame"]) >= STEPS
 
 
 def test_plan_tells_seconds_and_bytes_of_a_clip_and_pairs_have_no_frame_before(made: Path, tmp_path, capsys) -> None:

@@ -18,7 +18,6 @@ from synth.scene.template import SCENES
 from synth.simulate import indenter, simulate
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
-from synth.simulate.load_path import path_of
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.policy import load_steps, multipliers
 from synth.simulate.policy.newton import (
@@ -32,6 +31,7 @@ from synth.simulate.policy.newton import (
 )
 from synth.simulate.policy.requests import Asking
 from synth.simulate.press import Press
+from synth.simulate.scene_path import path_of
 from synth.simulate.solve import simulate_press
 from synth.simulate.trajectory import Trajectory
 

@@ -166,6 +166,37 @@ def test_friction_converges_with_the_step(element: str) -> None:
     assert coarse == pytest.approx(fine, rel=0.02)
 
 
+@pytest.mark.slow
+def test_the_stick_zone_is_cattaneos_and_mindlins_and_all_slides_where_the_pull_is_frictions() -> None:
+    """Of a contact of radius a what sticks has the radius a (1 - T / μN)^(1/3), with 12 elements over a.
+
+    Hertz's and Mindlin's solutions are of a half space; the pad is 12 a thick and wide.
+    """
+    depth, elements = CONTACT**2 / RADIUS, 12
+    inner = np.arange(elements + 2) / elements
+    radii = np.concatenate([inner, growing(inner[-1], FAR - inner[-1], 4, 2.2)])
+    mesh = disc(radii, np.concatenate([[0.0], growing(0.0, FAR, 5, 2.2)]), half=True)
+    # The bonded pad is 9 % stiffer than a half space, sideways and under the ball alike.
+    all_slips = 1.085 * 3 * FRICTION * (16 / 9 * np.sqrt(RADIUS) * depth**1.5) / (16 * CONTACT) * 4.5
+    shares = [*(1 - (1 - np.array([0.2, 0.5, 0.8])) ** (2 / 3)), 0.95, 1.05]
+    legs = [{"depth_mm": depth, "shear_mm": [share * all_slips, 0.0]} for share in shares]
+    ball, motion = {"shape": "sphere", "radius_mm": RADIUS}, {"depth_mm": depth, "steps": 1 + len(legs), "then": legs}
+    posed = scene((30.0, 30.0, FAR), indenter=ball, friction=FRICTION, motion=motion, numerics={"max_step_mm": depth})
+    body = System(supported(mesh, p2p1(), partial(walls_and_window, half=True)), uniform(len(mesh.tets), 0.5))
+    path = LoadPath(posed.motion, rigid_body(posed.contact.indenter))
+    ended = DirectPress(body, path, FRICTION, 1.0, LoadSteps(path, mesh.size_mm, True, posed.numerics, STANDARD)).run()
+    states = [state for state in ended.states if state.shear_mm[0] > 0]
+    pulls = np.array([state.force_n[0] / (FRICTION * state.force_n[2]) for state in states])
+    np.testing.assert_allclose(pulls[:3], [0.2, 0.5, 0.8], atol=0.02)
+    # Where it begins to slide as a whole: within one load step of where the pull reaches friction's limit.
+    reached = int(np.argmax(pulls > 0.999))
+    slides = int(np.argmax([state.slip_ratio > 1 - 1e-6 for state in states]))
+    assert 0 <= slides - reached <= 1
+    for state, pull in zip(states[:3], pulls, strict=False):
+        # Half an element's width is 4 % of the radius, and of .6 of it 7 %; contact points are as dense again.
+        assert np.sqrt(1 - state.slip_ratio) == pytest.approx((1 - pull) ** (1 / 3), rel=0.05)
+
+
 def test_partial_slip_is_mindlins() -> None:
     """A ball on a thick pad against Cattaneo and Mindlin (Johnson, Contact Mechanics, 1985, eqs. 7.41 to 7.43).
 

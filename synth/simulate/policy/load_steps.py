@@ -11,11 +11,12 @@ have to become shorter than SHORTEST_STEP ends at its last good state.
 from math import ceil
 
 from synth.scene import Numerics
-from synth.simulate.load_path import LoadPath
+from synth.simulate.load_path import TOUCH_MM, LoadPath
 from synth.simulate.options import SolverOptions
 from synth.simulate.policy.multipliers import Passes, allowed_share, polish
 from synth.simulate.policy.newton import Solution, relax, solve
 from synth.simulate.policy.requests import FORCE_FLOOR, Asking, Begin, Do, Evaluation, Record
+from synth.simulate.posed_path import IN_GEL, PosedPath
 from synth.simulate.trajectory import no_contact, not_converged, too_deep
 
 SHORTEST_STEP = 1 / 128
@@ -73,8 +74,10 @@ class LoadSteps:
         """
         if not self._path.may_touch:
             return ""
-        yield Begin(0.0)
+        start = yield Begin(0.0)
         yield Do.ACCEPT
+        if isinstance(self._path, PosedPath) and start.deepest_mm > TOUCH_MM:
+            self._reason = f"the object is {IN_GEL}"
         while self.next < len(self._waypoints) and not self._reason:
             yield from self._advance()
         return self._reason
