@@ -54,10 +54,11 @@ class Lane:
         """The orders of the next cycle, for what was seen in the last."""
 
     def _translated(self) -> Generator[int, Row, None]:
-        policy, numbers, answer = self._steps.run(), self._numbers, None
+        policy, numbers = self._steps.run(), self._numbers
+        answer: Any = None
         order, at, target, stiffening, size = 0, 0.0, 0.0, 1.0, 1.0
         numbers[STIFFENING] = 1.0
-        iterate = trial = None
+        iterate = trial = _evaluation([0.0] * len(Seen))
         is_stale = False  # whether the last evaluation was of a trial that was not taken
         while True:
             try:
@@ -90,7 +91,7 @@ class Lane:
                     answer = iterate = _evaluation((yield order | EVALUATE))
                     order, is_stale = 0, False
             elif kind is ask.Try:
-                if request.share < 1 or trial is None:
+                if request.share < 1:
                     numbers[SHARE] = request.share
                     trial = _evaluation((yield order | TRY))
                 answer, order, is_stale = trial, 0, True
