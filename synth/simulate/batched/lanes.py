@@ -22,8 +22,8 @@ a trajectory. These are the phases, in the order in which a load step passes thr
 
 import warp as wp
 
+from synth.press.distance import shape_vector
 from synth.simulate.contact import Indenters
-from synth.simulate.distance import shape_vector
 from synth.simulate.policy import requests
 
 IDLE, FRESH, FIRST, BEGIN, PREDICTOR, PREDICTOR_READY, PREDICTOR_LINEAR, START, READY, LINEAR = range(10)

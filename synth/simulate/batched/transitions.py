@@ -13,10 +13,10 @@ from typing import Any
 
 import warp as wp
 
+from synth.press.distance import KINDS
 from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.lanes import Lanes, Presses, Settings
 from synth.simulate.contact import Indenters
-from synth.simulate.distance import KINDS
 from synth.simulate.policy import load_steps, multipliers, newton, requests
 
 
