@@ -28,16 +28,16 @@ from synth.flow.exact import exact_flow
 from synth.flow.view import View
 from synth.mesh import PadMesh
 from synth.optics import Optics
+from synth.press.press import Press
+from synth.press.resolution import shared_mesh
+from synth.sampling import draw, samples_of
 from synth.scene import Scene
-from synth.scene.sampling import draw, samples_of
 from synth.scene.template import Template, load_scene
 from synth.simulate import Trajectory
 from synth.simulate.batched.gemm import Host
 from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.batched.run import OPTIONS, simulate_presses
 from synth.simulate.options import SolverOptions
-from synth.simulate.press import Press
-from synth.simulate.resolution import shared_mesh
 from synth.simulate.solve import check_shared
 from synth.surface import GelSurface
 

@@ -24,6 +24,8 @@ from benchmarks.press import PAD_MM, ball_scene, face_displacement, face_grid
 from benchmarks.rows import Row, arguments, machine, measure, show
 from synth.errors import InputError
 from synth.mesh import Counts, Focus, PadMesh, graded_box
+from synth.press.press import Press
+from synth.press.resolution import graded_mesh
 from synth.scene import Scene
 from synth.simulate import simulate
 from synth.simulate.batched.gemm import dense
@@ -31,8 +33,6 @@ from synth.simulate.batched.krylov import RUNNING, WAITING
 from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.batched.run import OPTIONS, Run
 from synth.simulate.batched.solver import INNER_ITERATIONS
-from synth.simulate.press import Press
-from synth.simulate.resolution import graded_mesh
 
 PLACES_MM = (6.0, 4.0)
 """Half width of the rectangle that the balls' centres are drawn from."""

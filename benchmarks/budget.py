@@ -35,15 +35,9 @@ from synth.mesh import Counts, Focus, PadMesh, domed, face_height, graded_box
 from synth.optics import Optics
 from synth.optics.camera import Paths
 from synth.planning.prediction import SOLVE_GROWTH
-from synth.scene import Gel, Scene
-from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, samples_of, sensor_of
-from synth.scene.template import Template, load_scene, shipped_scenes
-from synth.simulate import Trajectory, simulate
-from synth.simulate.footprint import footprint
-from synth.simulate.options import SolverOptions
-from synth.simulate.policy.newton import MAX_ITERATIONS
-from synth.simulate.press import MeshRule
-from synth.simulate.resolution import (
+from synth.press.footprint import footprint
+from synth.press.press import MeshRule
+from synth.press.resolution import (
     ELEMENTS_ACROSS,
     MARGIN,
     STEEPEST_DEPTH,
@@ -54,7 +48,13 @@ from synth.simulate.resolution import (
     mesh_levels,
     predicted_error_px,
 )
-from synth.simulate.scene_path import path_of
+from synth.press.scene_path import path_of
+from synth.sampling import MAX_DRAWS, draw, draw_sensor, samples_of, sensor_of
+from synth.scene import Gel, Scene
+from synth.scene.template import Template, load_scene, shipped_scenes
+from synth.simulate import Trajectory, simulate
+from synth.simulate.options import SolverOptions
+from synth.simulate.policy.newton import MAX_ITERATIONS
 
 FINER, BESIDE, STEP_MM = 2.4, (4, 3), 0.125
 """Of the reference: how many times smaller its elements are, elements beside the contact, longest load step."""

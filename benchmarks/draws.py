@@ -18,13 +18,13 @@ from multiprocessing import get_context
 from benchmarks.rows import Row, arguments, machine, measure, show
 from synth.errors import InputError
 from synth.pipeline.batched_simulation import BATCH, pad_key
-from synth.scene.sampling import draw, samples_of
+from synth.press.press import BLUNTER, MeshRule, Press, blunter
+from synth.sampling import draw, samples_of
 from synth.scene.template import SCENES, load_scene
 from synth.simulate import Trajectory
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
 from synth.simulate.policy.multipliers import DEEP
-from synth.simulate.press import BLUNTER, MeshRule, Press, blunter
 from synth.simulate.solve import simulate_press
 
 

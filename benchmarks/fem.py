@@ -34,18 +34,18 @@ from benchmarks.press import (
 )
 from benchmarks.rows import Row, arguments, machine, measure, plot, show
 from synth.mesh import Counts, Focus, PadMesh, graded_box
+from synth.mesh.element import Element, p1p1, p2p1
 from synth.mesh.tetrahedralise import tetrahedralise_box
+from synth.press.footprint import footprint
+from synth.press.resolution import MARGIN, graded_mesh
+from synth.press.scene_path import path_of
 from synth.scene import Scene
 from synth.simulate import Trajectory
 from synth.simulate.direct import DirectPress
-from synth.simulate.element import Element, p1p1, p2p1
-from synth.simulate.footprint import footprint
 from synth.simulate.material import pad_material
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.policy.load_steps import LoadSteps
 from synth.simulate.policy.newton import MAX_ITERATIONS
-from synth.simulate.resolution import MARGIN, graded_mesh
-from synth.simulate.scene_path import path_of
 from synth.simulate.space import function_space
 from synth.simulate.system import System
 

@@ -21,15 +21,15 @@ from benchmarks.rows import Row, arguments, measure, show
 from synth.cli_options import DEFAULT_SCENE
 from synth.errors import InputError
 from synth.mesh import PadMesh
+from synth.press.footprint import footprint
+from synth.press.press import MeshRule
+from synth.press.resolution import MARGIN, graded_mesh
+from synth.press.scene_path import path_of
+from synth.sampling import draw
 from synth.scene import Scene, Sphere
-from synth.scene.sampling import draw
 from synth.scene.template import checked_template, load_scene
 from synth.simulate import Trajectory, simulate
-from synth.simulate.footprint import footprint
 from synth.simulate.policy.multipliers import DEEP
-from synth.simulate.press import MeshRule
-from synth.simulate.resolution import MARGIN, graded_mesh
-from synth.simulate.scene_path import path_of
 
 SIZE_MM = 8.0
 BALL = Sphere(shape="sphere", radius_mm=4.0)

@@ -5,15 +5,15 @@ from dataclasses import dataclass
 from synth.arrays import Image, Points
 from synth.errors import InputError
 from synth.pipeline.render_session import FINER_DOME, SUBDIVISIONS
+from synth.press.press import MeshRule
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant
+from synth.sampling import MAX_DRAWS, draw, stream
 from synth.scene import Render, Scene, Sensor
-from synth.scene.sampling import MAX_DRAWS, draw, stream
 from synth.scene.template import Template
 from synth.scene.validation import validated
 from synth.simulate import simulate
-from synth.simulate.press import MeshRule
 from synth.surface import GelSurface
 
 

@@ -28,8 +28,8 @@ from synth.render.camera_image import render_noise
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer, full_grid
 from synth.render.variant import Device, Variant, choose_variant
+from synth.sampling import draw, stream
 from synth.scene import Render
-from synth.scene.sampling import draw, stream
 from synth.scene.template import Template, load_scene
 
 SAMPLES = (1, 4, 16, 36, 64, 144, 256, 576, 1024)

@@ -24,10 +24,10 @@ from synth.mesh.graded import kuhn_tets
 from synth.mesh.tetrahedralise import ROOM, Background, tetrahedralise
 from synth.optics import Optics
 from synth.pipeline.render_session import SUBDIVISIONS
+from synth.press.press import Press
 from synth.scene import Scene
 from synth.scene.template import load_scene
 from synth.simulate import Trajectory
-from synth.simulate.press import Press
 from synth.simulate.solve import direct_press, simulate_press
 from synth.surface import GelSurface
 

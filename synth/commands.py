@@ -141,9 +141,9 @@ def simulate(
 ) -> int:
     """Runs the finite-element simulation alone; renders nothing."""
     from synth.dataset.storage import refuse_foreign, storage_errors
+    from synth.press.press import MeshRule, as_pressed
     from synth.progress import progress
-    from synth.scene.sampling import draw
-    from synth.simulate.press import MeshRule, as_pressed
+    from synth.sampling import draw
     from synth.simulate.solve import simulate_press
     from synth.simulate.trajectory import write_trajectory
 

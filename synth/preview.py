@@ -20,8 +20,8 @@ from synth.render.pattern import albedo, pixels_per_mm
 from synth.render.renderer import Renderer
 from synth.render.rest_map import read_rest_map
 from synth.render.variant import Variant
+from synth.sampling import draw_sensor, stream
 from synth.scene import Render, Sensor
-from synth.scene.sampling import draw_sensor, stream
 from synth.scene.template import Template
 
 MARK = b"tEXtSoftware\0synth preview"

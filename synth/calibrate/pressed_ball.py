@@ -6,10 +6,10 @@ import numpy as np
 
 from synth.arrays import FloatArray, Points
 from synth.errors import InputError
+from synth.press.press import MeshRule
 from synth.scene import Scene, Sensor
 from synth.scene.validation import validated
 from synth.simulate import simulate
-from synth.simulate.press import MeshRule
 from synth.surface import GelSurface
 
 _TOUCHING_MM = 0.02

@@ -10,10 +10,10 @@ from typing import Any
 from synth.dataset.manifest import Failure
 from synth.errors import InputError
 from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory, Task
+from synth.press.press import Press, blunter
+from synth.sampling import MAX_DRAWS, SampleFrames, SensorInstance, draw, samples_of
 from synth.scene import Scene
-from synth.scene.sampling import MAX_DRAWS, SampleFrames, SensorInstance, draw, samples_of
 from synth.simulate import Trajectory
-from synth.simulate.press import Press, blunter
 
 
 @dataclass(frozen=True, eq=False)

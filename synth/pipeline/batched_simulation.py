@@ -16,12 +16,12 @@ import warp as wp
 
 from synth.pipeline.attempts import Attempt, Attempts
 from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory, Task
+from synth.press.press import Press
+from synth.sampling import SensorInstance, draw_sensor, sensor_of
 from synth.scene import Gel
-from synth.scene.sampling import SensorInstance, draw_sensor, sensor_of
 from synth.scene.template import Template
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import Pad, prepare
-from synth.simulate.press import Press
 
 BATCH = {"cuda": 256, "cpu": 8}
 """Trajectories at once."""

@@ -24,17 +24,17 @@ from synth.flow.view import View
 from synth.optics import Optics
 from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory
 from synth.pipeline.render_session import Frame, RenderedTrajectory
+from synth.press.press import as_pressed
+from synth.press.resolution import accuracy
 from synth.render.camera_image import camera_image
 from synth.render.chart import chart_of
 from synth.render.exposure import advice, levels_of
 from synth.render.pattern import dots_of
 from synth.render.rest_map import read_rest_map
+from synth.sampling import SampleFrames
 from synth.scene import Camera, MeshIndenter, Outputs
-from synth.scene.sampling import SampleFrames
 from synth.simulate import State
 from synth.simulate.contact_patch import ContactPatch
-from synth.simulate.press import as_pressed
-from synth.simulate.resolution import accuracy
 
 LEAST_GEL = 0.5
 """Share of pixels that show gel, below which images are warned of."""

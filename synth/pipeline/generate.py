@@ -41,8 +41,8 @@ from synth.pipeline.records import JobContext, Outcome, Task
 from synth.pipeline.worker_pool import cores, outcomes_of_processes
 from synth.planning import Plan, plan, predict
 from synth.render.variant import Variant
+from synth.sampling import draw_sensor, sensor_of
 from synth.scene import Gel
-from synth.scene.sampling import draw_sensor, sensor_of
 from synth.scene.template import Template
 
 SOLVER_BYTES, WORKER_BYTES = 6 * 2**30, 2 * 2**30

@@ -8,7 +8,7 @@ from synth.pipeline.batched_simulation import Pads
 from synth.pipeline.finishing import finish
 from synth.pipeline.records import JobContext, Outcome
 from synth.pipeline.render_session import RenderSession
-from synth.scene.sampling import draw_sensor, sensor_of
+from synth.sampling import draw_sensor, sensor_of
 from synth.simulate.batched import simulate_presses
 from synth.simulate.solve import simulate_press
 

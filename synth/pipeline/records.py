@@ -12,11 +12,11 @@ from synth.dataset.job import Job
 from synth.dataset.manifest import Failure, ManifestEntry
 from synth.dataset.store import Output, mesh_folder
 from synth.planning import Plan
+from synth.press.load_path import LoadPath
+from synth.press.resolution import Accuracy
+from synth.sampling import SampleFrames, stream
 from synth.scene import Scene
-from synth.scene.sampling import SampleFrames, stream
 from synth.simulate import State
-from synth.simulate.load_path import LoadPath
-from synth.simulate.resolution import Accuracy
 from synth.surface import ContactFaces
 
 Task = tuple[int, tuple[int, ...]]

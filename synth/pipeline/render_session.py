@@ -16,8 +16,8 @@ from synth.pipeline.records import JobContext, SimulatedTrajectory
 from synth.render.measured_light import read_measured_light
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
+from synth.sampling import draw
 from synth.scene import Scene
-from synth.scene.sampling import draw
 from synth.surface import GelSurface
 
 SUBDIVISIONS = {False: 4, True: 3}

@@ -8,6 +8,9 @@ from typing import Any, Literal
 from synth.errors import InputError
 from synth.mesh import default_edge_length, face_of
 from synth.mesh.cad import CadFace
+from synth.press.indenter import object_triangles, rigid_body
+from synth.press.press import MeshRule
+from synth.press.scene_path import path_of
 from synth.render.camera_rays import pinhole
 from synth.render.coating import is_separated
 from synth.render.measured_light import read_measured_light
@@ -15,13 +18,10 @@ from synth.render.pattern import check_pattern, is_grey
 from synth.render.rest_map import read_rest_map
 from synth.render.thin_lens import check_views
 from synth.render.variant import Variant, job_variant
+from synth.sampling import check_pairs
 from synth.scene import MeshIndenter
-from synth.scene.sampling import check_pairs
 from synth.scene.template import Template, load_scene
-from synth.simulate.indenter import object_triangles, rigid_body
 from synth.simulate.material import DISPLACEMENT_ONLY_BELOW
-from synth.simulate.press import MeshRule
-from synth.simulate.scene_path import path_of
 
 
 @dataclass(frozen=True)

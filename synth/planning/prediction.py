@@ -1,7 +1,7 @@
 """What a plan will cost, and how exact its simulation will be: predicted from the meshes of some random instances.
 
 The costs are predictions from constants measured on one core of a 2-core x86-64 server; other machines differ by a
-factor of two or three either way. Errors are predictions of `synth.simulate.resolution`. Choosing the meshes takes
+factor of two or three either way. Errors are predictions of `synth.press.resolution`. Choosing the meshes takes
 seconds, so that `generate`, which needs none of this, does not ask for it.
 """
 
@@ -14,11 +14,11 @@ from synth.errors import InputError
 from synth.mesh import default_edge_length
 from synth.mesh.layered import elements_through
 from synth.planning.plan import Plan
+from synth.press.press import edge_radius_mm
+from synth.press.resolution import Resolution, resolution_mm
+from synth.press.scene_path import path_of
+from synth.sampling import draw
 from synth.scene import Gel, MeshIndenter, Scene
-from synth.scene.sampling import draw
-from synth.simulate.press import edge_radius_mm
-from synth.simulate.resolution import Resolution, resolution_mm
-from synth.simulate.scene_path import path_of
 from synth.simulate.solve import VICINITY
 
 _Meshes = tuple[list[tuple[Scene, int]], str, tuple[float, float] | None]

@@ -1,7 +1,7 @@
 """The schema of a scene: one sensor, one contact, one motion, every number fixed.
 
 A scene file may hold distributions in place of numbers (`synth.scene.template`); drawing from them
-(`synth.scene.sampling`) gives a `Scene` of this schema. Lengths are mm, angles degrees, stiffness kPa, image quantities
+(`synth.sampling`) gives a `Scene` of this schema. Lengths are mm, angles degrees, stiffness kPa, image quantities
 px; the unit is in the field's name. Frame: origin at the centre of the undeformed contact surface, +z from there
 through the gel toward the camera, +x right and +y down in the image (a left-handed triple, see docs/decisions.md).
 """

@@ -7,7 +7,7 @@ a choice of the files that match. `extends = "gelsight_mini"` takes the rest fro
 
 A scene is checked when it is loaded: at the lower and upper end of all its distributions and for every choice, so that
 a mistake shows before any work is done. A `normal` is checked at its mean: a number from its tails that breaks the
-schema is drawn again (`synth.scene.sampling`).
+schema is drawn again (`synth.sampling`).
 """
 
 import hashlib

@@ -1,6 +1,6 @@
 r"""Energy and residual of the bulk in displacement and pressure, as Warp kernels; tangent: `synth.simulate.stiffness`.
 
-The energy is `synth.simulate.material`'s, stabilised as in `synth.simulate.element` and, with a pressure field p, by
+The energy is `synth.simulate.material`'s, stabilised as in `synth.mesh.element` and, with a pressure field p, by
 
 .. math::  ½ γ(p) D², \qquad D = J - 1 - p/λ, \qquad γ = λ f(C \max(0, -\bar p) / λ)   (p̄: mean over the element)
 
@@ -34,11 +34,11 @@ class Bulk:
     gradient: wp.array3d(dtype=wp.vec3d)  # (m, nq, nn) 1/mm, undeformed gradients of the displacement's shape functions
     weight: wp.array2d(dtype=wp.float64)  # (m, nq) mm³
     pressure_shape: wp.array2d(dtype=wp.float64)  # (nq, 4)
-    stabilisation: wp.array3d(dtype=wp.float64)  # (m, 4, 4) constant pressure block of `synth.simulate.element`
+    stabilisation: wp.array3d(dtype=wp.float64)  # (m, 4, 4) constant pressure block of `synth.mesh.element`
     shear: wp.array(dtype=wp.float64)  # (m,) μ
     compliance: wp.array(dtype=wp.float64)  # (m,) 1/λ
     mixed: int  # whether there is a pressure field
-    hold: wp.float64  # C, of `synth.simulate.element`
+    hold: wp.float64  # C, of `synth.mesh.element`
     yeoh: wp.array(dtype=wp.vec2d)  # (m,) c_2, c_3
 
 

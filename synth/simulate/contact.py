@@ -25,7 +25,7 @@ again where multipliers are updated (`synth.simulate.multipliers`) and where the
 
 import warp as wp
 
-from synth.simulate.distance import TINY, beyond_grid, normal_derivative, shape_vector, signed_distance
+from synth.press.distance import TINY, beyond_grid, normal_derivative, shape_vector, signed_distance
 
 ON_CONE = wp.constant(wp.float64(1.0 - 1.0e-9))
 """A point slips whose traction is this share of the limit. (Inside a kernel 1.0 - 1.0e-9 would be float32: 1.)"""
@@ -36,12 +36,12 @@ class Indenters:
     """The rigid bodies of a batch.
 
     Attributes:
-        kind, shape: (B,) as in `synth.simulate.distance`.
+        kind, shape: (B,) as in `synth.press.distance`.
         coefficients: (B, i, j, k) B-spline coefficients of mesh indenters, else of size one.
         centre: (B,) world position of the origin of the indenter's frame, mm.
         rotation: (B,) its frame's axes as columns.
         friction: (B,) Coulomb coefficient.
-        sharpness: (B,) factor on the contact stiffness ε; see `synth.simulate.indenter`.
+        sharpness: (B,) factor on the contact stiffness ε; see `synth.press.indenter`.
     """
 
     kind: wp.array(dtype=wp.int32)

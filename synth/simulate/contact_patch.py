@@ -10,9 +10,9 @@ narrower than an element (morphological closing with half an element's width, on
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Points
-from synth.simulate.indenter import RigidBody
-from synth.simulate.load_path import LoadPath, Pose
-from synth.simulate.measure import Distance
+from synth.press.indenter import RigidBody
+from synth.press.load_path import LoadPath, Pose
+from synth.press.measure import Distance
 from synth.surface import ContactFaces, GelSurface
 
 SUBDIVISIONS = 8

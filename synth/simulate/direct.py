@@ -8,9 +8,9 @@ from typing import Any, cast
 import numpy as np
 
 from synth.arrays import FloatArray
+from synth.press.load_path import LoadPath
 from synth.simulate.contact import Indenters
 from synth.simulate.linear import norm
-from synth.simulate.load_path import LoadPath
 from synth.simulate.policy import requests as ask
 from synth.simulate.policy.load_steps import LoadSteps
 from synth.simulate.policy.newton import NEAR

@@ -9,15 +9,15 @@ import numpy as np
 from synth.arrays import BoolArray, FloatArray
 from synth.errors import InputError
 from synth.mesh import PadMesh, check_mesh, face_of
+from synth.press.load_path import LoadPath
+from synth.press.measure import Distance
+from synth.press.press import Press
+from synth.press.resolution import ELEMENTS
 from synth.scene import Gel, Scene
 from synth.simulate.direct import DirectPress
-from synth.simulate.load_path import LoadPath
 from synth.simulate.material import pad_material
-from synth.simulate.measure import Distance
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.policy.load_steps import LoadSteps
-from synth.simulate.press import Press
-from synth.simulate.resolution import ELEMENTS
 from synth.simulate.space import Space, function_space
 from synth.simulate.system import System
 from synth.simulate.trajectory import State, Trajectory

@@ -11,7 +11,7 @@ import numpy as np
 
 from synth.arrays import BoolArray, Points, Tets
 from synth.mesh import PadMesh
-from synth.simulate.element import EDGES, Element
+from synth.mesh.element import EDGES, Element
 from synth.surface import FACE_EDGES, ContactFaces
 
 

@@ -8,12 +8,12 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from synth.arrays import FloatArray
+from synth.mesh.element import EDGES
 from synth.mesh.pad import barycentric_gradients
+from synth.press.load_path import LoadPath, Pose
 from synth.simulate.bulk import Bulk
 from synth.simulate.contact import Faces, Indenters
-from synth.simulate.element import EDGES
 from synth.simulate.inversion_barrier import SAMPLE_DEGREE, BarrierTables
-from synth.simulate.load_path import LoadPath, Pose
 from synth.simulate.material import Material
 from synth.simulate.space import Space
 from synth.surface import broken_linear_face

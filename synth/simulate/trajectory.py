@@ -9,9 +9,9 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.dataset.storage import replace_file, storage_errors
+from synth.press.load_path import LoadPath, Pose
 from synth.scene import Scene
 from synth.simulate.contact_patch import ContactPatch
-from synth.simulate.load_path import LoadPath, Pose
 from synth.simulate.space import Space
 
 

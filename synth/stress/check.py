@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from synth.arrays import FloatArray
+from synth.mesh.element import quadratic_derivative
 from synth.mesh.pad import barycentric_gradients
-from synth.simulate.element import quadratic_derivative
 from synth.stress.cases import Comparison, Expectation, Run
 
 GAUSS = np.full((4, 4), (5 - np.sqrt(5)) / 20) + np.eye(4) / np.sqrt(5)

@@ -17,11 +17,11 @@ from synth.arrays import Points
 from synth.errors import InputError
 from synth.mesh import PadMesh
 from synth.mesh.tetrahedralise import shape_quality
+from synth.press.press import MeshRule
 from synth.scene import Scene
 from synth.scene.template import load_scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.options import SolverOptions
-from synth.simulate.press import MeshRule
 from synth.stress.cases import Case, Run, SurfaceVariant
 
 NEAR = 1e-5

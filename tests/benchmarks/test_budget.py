@@ -13,13 +13,13 @@ from benchmarks.budget import LEAST_SEEN, drawn, judge, picture_errors, places, 
 from benchmarks.press import face_displacement
 from benchmarks.rows import Row, read
 from synth.errors import InputError
-from synth.scene.sampling import draw, samples_of
+from synth.press.footprint import footprint
+from synth.press.press import MeshRule
+from synth.press.resolution import MARGIN, graded_mesh, scale_px_per_mm
+from synth.press.scene_path import path_of
+from synth.sampling import draw, samples_of
 from synth.scene.template import load_scene
 from synth.simulate import simulate
-from synth.simulate.footprint import footprint
-from synth.simulate.press import MeshRule
-from synth.simulate.resolution import MARGIN, graded_mesh, scale_px_per_mm
-from synth.simulate.scene_path import path_of
 
 TINY = """
 name = "tiny"

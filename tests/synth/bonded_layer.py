@@ -27,8 +27,8 @@ from scipy.optimize import brentq
 
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import PadMesh
+from synth.mesh.element import Element
 from synth.simulate.contact import Indenters
-from synth.simulate.element import Element
 from synth.simulate.material import uniform
 from synth.simulate.system import System
 

@@ -16,21 +16,21 @@ from tiny_scene import home
 
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import PadMesh, pad_mesh
+from synth.mesh.element import Element, p1p1, p2p1
 from synth.mesh.graded import kuhn_tets
+from synth.press.indenter import rigid_body
+from synth.press.load_path import LoadPath
+from synth.press.press import Press
 from synth.scene import Gel, Numerics, Scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
 from synth.simulate.contact import Indenters
 from synth.simulate.direct import DirectPress, DirectSolver, led
-from synth.simulate.element import Element, p1p1, p2p1
-from synth.simulate.indenter import rigid_body
-from synth.simulate.load_path import LoadPath
 from synth.simulate.material import Material, uniform
 from synth.simulate.options import SolverOptions
 from synth.simulate.policy import newton
 from synth.simulate.policy.requests import Do
-from synth.simulate.press import Press
 from synth.simulate.solve import direct_press
 from synth.simulate.space import Space, function_space
 from synth.simulate.system import Residual, System, Tangent, Unknowns

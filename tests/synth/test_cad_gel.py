@@ -23,11 +23,14 @@ from synth.flow.exact import exact_flow
 from synth.flow.view import View
 from synth.mesh import check_mesh, domed, rest_surface
 from synth.mesh.capsule import CapsuleFace
+from synth.mesh.element import p2p1
 from synth.mesh.face import face_of
 from synth.mesh.pad import boundary_faces
 from synth.optics import Optics
 from synth.pipeline.generate import generate
 from synth.planning import check_buildable, job_variant
+from synth.press.press import MeshRule
+from synth.press.scene_path import path_of
 from synth.render.chart import chart_of
 from synth.render.pattern import albedo
 from synth.scene import Gel, Scene
@@ -35,9 +38,6 @@ from synth.scene.gel_file import measured
 from synth.scene.part import Vector3
 from synth.scene.template import load_scene
 from synth.simulate import Trajectory
-from synth.simulate.element import p2p1
-from synth.simulate.press import MeshRule
-from synth.simulate.scene_path import path_of
 from synth.simulate.space import function_space
 from synth.surface import GelSurface
 from synth.verify.dataset import verify_dataset

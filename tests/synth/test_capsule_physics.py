@@ -19,12 +19,12 @@ from scipy.integrate import quad
 from synth.arrays import FloatArray
 from synth.mesh import check_mesh, mesh_key
 from synth.mesh.capsule import CapsuleFace
+from synth.mesh.element import p2p1
+from synth.press.press import MeshRule, Press
+from synth.press.scene_path import path_of
 from synth.scene import Gel, Numerics, Scene
 from synth.simulate import Trajectory, simulate
-from synth.simulate.element import p2p1
 from synth.simulate.material import pad_material
-from synth.simulate.press import MeshRule, Press
-from synth.simulate.scene_path import path_of
 from synth.simulate.solve import direct_press
 from synth.simulate.space import function_space
 from synth.simulate.system import Unknowns

@@ -9,13 +9,13 @@ from pads import brick, scene
 
 from synth.arrays import FloatArray, Points
 from synth.mesh import Focus
+from synth.mesh.element import p2p1
+from synth.press.indenter import rigid_body
+from synth.press.load_path import Pose
+from synth.press.press import MeshRule, Press
+from synth.press.resolution import CONTACT_ACROSS, graded_mesh
 from synth.scene import Cylinder, Indenter, Sphere, Torus
 from synth.simulate.contact_patch import ContactPatch
-from synth.simulate.element import p2p1
-from synth.simulate.indenter import rigid_body
-from synth.simulate.load_path import Pose
-from synth.simulate.press import MeshRule, Press
-from synth.simulate.resolution import CONTACT_ACROSS, graded_mesh
 from synth.simulate.solve import simulate_press
 from synth.simulate.space import function_space
 from synth.surface import GelSurface

@@ -10,8 +10,8 @@ from pads import scene
 
 from synth.cli import main
 from synth.dataset.reader import read_dataset
+from synth.press.press import MeshRule
 from synth.scene import Scene
-from synth.simulate.press import MeshRule
 
 SIZE = (12.0, 10.0, 4.0)
 

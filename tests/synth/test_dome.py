@@ -21,16 +21,16 @@ from synth.errors import InputError
 from synth.flow.trace import trace
 from synth.mesh import Counts, Focus, PadMesh, domed, graded_box, rest_surface
 from synth.mesh.cache import pad_mesh
+from synth.mesh.element import p2p1
 from synth.optics import Optics
 from synth.pipeline.generate import generate
+from synth.press.footprint import footprint
+from synth.press.indenter import rigid_body
+from synth.press.load_path import LoadPath
+from synth.press.resolution import graded_mesh
 from synth.scene import Box, Gel, Indenter, Motion, Numerics, Scene, Sphere, Torus, Window
 from synth.scene.template import load_scene
 from synth.simulate import Trajectory, simulate
-from synth.simulate.element import p2p1
-from synth.simulate.footprint import footprint
-from synth.simulate.indenter import rigid_body
-from synth.simulate.load_path import LoadPath
-from synth.simulate.resolution import graded_mesh
 from synth.simulate.space import function_space
 from synth.surface import GelSurface
 from synth.verify import verify_dataset

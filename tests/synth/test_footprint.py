@@ -10,14 +10,14 @@ from pads import PUNCH, scene
 
 from benchmarks.probe import probe
 from synth.mesh import Focus
+from synth.press.error_model import RATE, face_error
+from synth.press.footprint import FINEST_MM, RESOLUTION, UNTOUCHED, footprint
+from synth.press.indenter import rigid_body
+from synth.press.load_path import LoadPath
+from synth.press.press import MeshRule
+from synth.press.resolution import ELEMENTS_ACROSS, MARGIN, graded_mesh, predicted_error_px, scale_px_per_mm
 from synth.scene import Box, Cone, Cylinder, Indenter, MeshIndenter, Motion, Pose, Scene, Sphere, Torus
 from synth.simulate import simulate
-from synth.simulate.error_model import RATE, face_error
-from synth.simulate.footprint import FINEST_MM, RESOLUTION, UNTOUCHED, footprint
-from synth.simulate.indenter import rigid_body
-from synth.simulate.load_path import LoadPath
-from synth.simulate.press import MeshRule
-from synth.simulate.resolution import ELEMENTS_ACROSS, MARGIN, graded_mesh, predicted_error_px, scale_px_per_mm
 
 Pair = tuple[float, float]
 SIZE = (20.0, 15.0, 4.0)

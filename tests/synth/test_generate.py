@@ -17,7 +17,7 @@ from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, generate
 from synth.progress import progress
 from synth.render.variant import choose_variant
-from synth.scene.sampling import draw
+from synth.sampling import draw
 from synth.scene.template import Template, load_scene
 from synth.verify import verify_dataset
 

@@ -28,12 +28,12 @@ from synth.pipeline.overlapped import prefetched
 from synth.pipeline.producer import Producer
 from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory, Task
 from synth.planning import plan, predict
+from synth.press.press import MeshRule, edge_radius_mm
+from synth.press.resolution import accuracy, shared_mesh, shared_spacing_mm
 from synth.render.variant import Variant
+from synth.sampling import MAX_DRAWS, draw, draw_sensor, sensor_of
 from synth.scene import Gel, Numerics, Scene
-from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, sensor_of
 from synth.scene.template import Template, load_scene
-from synth.simulate.press import MeshRule, edge_radius_mm
-from synth.simulate.resolution import accuracy, shared_mesh, shared_spacing_mm
 from synth.simulate.solve import simulate_press
 
 SPHERE = '{ shape = "sphere", radius_mm = { uniform = [1.5, 2.5] } }'

@@ -11,9 +11,9 @@ from commands import refused
 from scipy.spatial import ConvexHull, cKDTree
 
 from synth.arrays import FloatArray
+from synth.press.distance import normal_derivative, shape_vector, signed_distance
+from synth.press.indenter import RigidBody, rigid_body, rotation_about
 from synth.scene import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus
-from synth.simulate.distance import normal_derivative, shape_vector, signed_distance
-from synth.simulate.indenter import RigidBody, rigid_body, rotation_about
 
 SPHERE = Sphere(shape="sphere", radius_mm=1.5)
 CYLINDER = Cylinder(shape="cylinder", radius_mm=1.2, length_mm=2.0, fillet_mm=0.3)

@@ -13,9 +13,12 @@ from pads import complete, same, scene
 from benchmarks.probe import probe
 from synth.errors import InputError
 from synth.mesh import Counts, Focus, graded_box
+from synth.press import indenter
+from synth.press.press import Press
+from synth.press.scene_path import path_of
 from synth.scene import Scene
 from synth.scene.template import SCENES
-from synth.simulate import indenter, simulate
+from synth.simulate import simulate
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
 from synth.simulate.options import STANDARD, SolverOptions
@@ -30,8 +33,6 @@ from synth.simulate.policy.newton import (
     solve,
 )
 from synth.simulate.policy.requests import Asking
-from synth.simulate.press import Press
-from synth.simulate.scene_path import path_of
 from synth.simulate.solve import simulate_press
 from synth.simulate.trajectory import Trajectory
 

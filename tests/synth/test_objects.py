@@ -11,9 +11,9 @@ from commands import refused
 from pads import areas
 
 from synth.arrays import FloatArray
+from synth.press.indenter import EVERYTHING, OBJECT_RADIUS, RigidBody, Touchable, object_radius, rigid_body
+from synth.press.measure import Distance
 from synth.scene import Box, MeshIndenter
-from synth.simulate.indenter import EVERYTHING, OBJECT_RADIUS, RigidBody, Touchable, object_radius, rigid_body
-from synth.simulate.measure import Distance
 
 FOLDER = Path(__file__).parents[2] / "scenes" / "objects"
 FILES = sorted(FOLDER.glob("*.stl"))

@@ -15,11 +15,11 @@ from synth.dataset.reader import read_dataset
 from synth.mesh import pad_mesh
 from synth.pipeline.generate import generate
 from synth.planning import check_buildable, job_variant, plan, predict
+from synth.press.indenter import rigid_body
+from synth.press.press import DEFAULT_TARGET_PX, MeshRule
 from synth.render.variant import Variant
-from synth.scene.sampling import draw
+from synth.sampling import draw
 from synth.scene.template import load_scene, shipped_scenes
-from synth.simulate.indenter import rigid_body
-from synth.simulate.press import DEFAULT_TARGET_PX, MeshRule
 
 LLVM, MONO, SCALAR = Variant("llvm_ad_rgb", ""), Variant("llvm_ad_mono", ""), Variant("scalar_rgb", "")
 AWAY = "sensor.lights=[{position_mm=[3, 0, 3], aim_mm=[3, 0, 4], size_mm=[1, 1], color=[1, 1, 1], power=1}]"

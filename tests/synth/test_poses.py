@@ -15,13 +15,13 @@ from synth.dataset.export import export
 from synth.dataset.reader import read_dataset
 from synth.pipeline.generate import generate
 from synth.planning import plan, predict
+from synth.press.scene_path import path_of
 from synth.render.variant import Variant
+from synth.sampling import draw
 from synth.scene import Scene
 from synth.scene.pose_file import HEADER
-from synth.scene.sampling import draw
 from synth.scene.template import load_scene
 from synth.simulate import Trajectory, simulate
-from synth.simulate.scene_path import path_of
 from synth.verify import verify_dataset
 
 pytestmark = pytest.mark.usefixtures("one_cache")

@@ -8,8 +8,8 @@ import pytest
 from commands import refused
 from scipy import stats
 
+from synth.sampling import MAX_DRAWS, check_pairs, draw, draw_sensor, samples_of, stream
 from synth.scene import Scene
-from synth.scene.sampling import MAX_DRAWS, check_pairs, draw, draw_sensor, samples_of, stream
 from synth.scene.template import Template, load_scene, shipped_scenes
 
 COUNT = 200

@@ -16,12 +16,12 @@ from synth.mesh import face_of
 from synth.optics import Optics
 from synth.pipeline.generate import generate
 from synth.planning import job_variant, plan, predict
+from synth.press.indenter import turned_by
 from synth.render.lights import check_view
 from synth.render.pattern import albedo, pixels_per_mm
+from synth.sampling import draw, draw_sensor
 from synth.scene import MeshIndenter, Scene
-from synth.scene.sampling import draw, draw_sensor
 from synth.scene.template import SCENES, Template, load_scene
-from synth.simulate.indenter import turned_by
 
 WIDE = ["gelsight_mini", "deltact", "gelsight"]  # Scenes of six kinds of indenter and motions up to 25 px
 OPTICAL = ["gelslim", "gelstereo", "tac3d", "fingervision", "digit", "digit_calibrated", "soft_bubble"]

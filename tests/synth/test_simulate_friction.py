@@ -9,10 +9,10 @@ from bonded_layer import disc, growing, walls_and_window
 from pads import DRAG, FILM, MIXED, PUNCH, SIZE, SPHERE, brick, complete, gentle, pad, run, scene, supported
 from touching import Touch
 
+from synth.mesh.element import p2p1
+from synth.press.indenter import rigid_body
+from synth.press.load_path import LoadPath
 from synth.simulate.direct import DirectPress
-from synth.simulate.element import p2p1
-from synth.simulate.indenter import rigid_body
-from synth.simulate.load_path import LoadPath
 from synth.simulate.material import uniform
 from synth.simulate.options import STANDARD
 from synth.simulate.policy.load_steps import LoadSteps

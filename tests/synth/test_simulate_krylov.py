@@ -8,6 +8,7 @@ import scipy.sparse
 import warp as wp
 from pads import SIZE, brick, scene
 
+from synth.press.press import Press
 from synth.simulate.batched import krylov as kernels
 from synth.simulate.batched.gemm import dense
 from synth.simulate.batched.krylov import Krylov, arnoldi, block_size, flat, padded, round_rows
@@ -18,7 +19,6 @@ from synth.simulate.linear import GMRES_LIMIT
 from synth.simulate.options import STANDARD
 from synth.simulate.policy.load_steps import LoadSteps
 from synth.simulate.policy.requests import Solve
-from synth.simulate.press import Press
 
 
 def _systems(batch: int, device: str = "cpu") -> tuple[Krylov, list[Any]]:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from pads import SPHERE, scene
 
+from synth.press.indenter import rigid_body, rotation_about
+from synth.press.load_path import TWIST_ARM_MM, LoadPath, PressFrame
 from synth.scene import Motion
-from synth.simulate.indenter import rigid_body, rotation_about
-from synth.simulate.load_path import TWIST_ARM_MM, LoadPath, PressFrame
 
 
 def path(indenter: dict | None = None, **motion: Any) -> LoadPath:

@@ -8,11 +8,11 @@ from scipy.optimize import brentq
 
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import Focus
+from synth.mesh.element import p2p1
+from synth.press.resolution import graded_mesh
 from synth.scene import Gel
-from synth.simulate.element import p2p1
 from synth.simulate.inversion_barrier import ONSET, SAMPLE_DEGREE
 from synth.simulate.material import lame_constants, pad_material, uniform
-from synth.simulate.resolution import graded_mesh
 from synth.simulate.space import function_space
 from synth.simulate.system import System, Unknowns
 

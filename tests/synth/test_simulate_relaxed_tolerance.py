@@ -23,6 +23,7 @@ from pads import (
 )
 
 from synth.mesh import PadMesh
+from synth.press.press import Press
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.batched.lanes import Order
@@ -33,7 +34,6 @@ from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.policy import load_steps, multipliers, newton
 from synth.simulate.policy.newton import NEAR, Solution, solve
 from synth.simulate.policy.requests import Asking, Evaluation
-from synth.simulate.press import Press
 from synth.simulate.solve import direct_press
 from synth.simulate.system import System
 

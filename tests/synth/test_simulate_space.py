@@ -15,7 +15,7 @@ import synth.simulate.pattern as pattern_module
 from benchmarks.probe import probe
 from synth.arrays import FloatArray, Points
 from synth.mesh import PadMesh
-from synth.simulate.element import EDGES
+from synth.mesh.element import EDGES
 from synth.simulate.pattern import pattern_of
 from synth.simulate.space import Space, function_space
 from synth.surface import FACE_EDGES, broken_linear_face, quadratic_face

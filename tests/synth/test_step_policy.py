@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from pads import SPHERE, scene
 
+from synth.press.indenter import rigid_body
+from synth.press.load_path import LoadPath
 from synth.simulate.direct import led
-from synth.simulate.indenter import rigid_body
-from synth.simulate.load_path import LoadPath
 from synth.simulate.options import SolverOptions
 from synth.simulate.policy import load_steps, multipliers, newton
 from synth.simulate.policy import requests as ask

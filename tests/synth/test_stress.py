@@ -13,8 +13,8 @@ from commands import refused
 from pads import brick
 
 from synth.errors import InputError
+from synth.mesh.element import p2p1
 from synth.scene.template import load_scene
-from synth.simulate.element import p2p1
 from synth.simulate.space import function_space
 from synth.stress.cases import EXTREME, Case, Deviation, Run, all_runs, compared, load_expectations, selected
 from synth.stress.check import GAUSS, Result, evaluate, faults, measured, smallest_jacobian

@@ -14,9 +14,9 @@ STAGES = (
     "synth.errors", "synth.arrays", "synth.untrusted",
     "synth.warp_start",
     "synth.dataset.storage",  # how a file gets to the disk as a whole; knows nothing of datasets
-    "synth.scene", "synth.surface", "synth.optics", "synth.mesh", "synth.simulate", "synth.flow",
+    "synth.scene", "synth.surface", "synth.optics", "synth.mesh", "synth.press", "synth.simulate", "synth.flow",
     "synth.render",
-    "synth.scene.sampling",  # draws again what could not be rendered
+    "synth.sampling",  # draws again what could not be rendered
     "synth.dataset", "synth.verify", "synth.inspect", "synth.planning", "synth.pipeline",
     "synth.preview",
     "synth.progress", "synth.calibrate", "synth.stress", "synth.doctor", "synth.cli_options", "synth.commands",

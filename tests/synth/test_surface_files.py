@@ -15,11 +15,11 @@ from pads import complete, scene
 
 from synth.arrays import FloatArray
 from synth.mesh import Counts, Focus, graded_box
+from synth.press.indenter import EVERYTHING, RigidBody, Touchable, rigid_body
+from synth.press.measure import Distance
 from synth.scene import Box, MeshIndenter, Sphere
 from synth.scene.surface_file import FORMATS, read_surface
 from synth.scene.surface_shells import is_closed, outward
-from synth.simulate.indenter import EVERYTHING, RigidBody, Touchable, rigid_body
-from synth.simulate.measure import Distance
 
 Surface = tuple[FloatArray, np.ndarray]
 

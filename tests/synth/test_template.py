@@ -8,7 +8,7 @@ import pytest
 from commands import refused
 from tiny_scene import CONTACT, TEXT, write_tiny
 
-from synth.scene.sampling import draw
+from synth.sampling import draw
 from synth.scene.template import SCENES, checked_template, load_scene, shipped_scenes
 
 

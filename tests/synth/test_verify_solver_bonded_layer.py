@@ -13,7 +13,7 @@ from bonded_layer import ball_ratio, body, compliance, disc, growing, kappa, low
 from scipy.optimize import brentq
 
 from synth.arrays import FloatArray
-from synth.simulate.element import p1p1, p2p1
+from synth.mesh.element import p1p1, p2p1
 
 LINEAR = 0.005
 """Depth over thickness; finite strain changes the force by some 0.2 % there (see the vanishing depth below)."""

@@ -16,13 +16,13 @@ from pads import ELEMENT, FILM, MIXED, SIZE, complete, contact_faces, pad, run, 
 
 from synth.arrays import FloatArray
 from synth.mesh import PadMesh
+from synth.press.press import Press
 from synth.scene import Scene
 from synth.simulate.contact import Indenters
 from synth.simulate.direct import DirectPress
 from synth.simulate.material import pad_material
 from synth.simulate.options import STANDARD
 from synth.simulate.policy.load_steps import LoadSteps
-from synth.simulate.press import Press
 from synth.simulate.space import Space, function_space
 from synth.simulate.system import Residual, System, Unknowns
 

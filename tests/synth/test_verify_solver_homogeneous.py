@@ -23,7 +23,7 @@ from pads import crooked, equilibrium, face_load, layered, mapped, supported
 
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import PadMesh
-from synth.simulate.element import Element, p1p1, p2p1
+from synth.mesh.element import Element, p1p1, p2p1
 from synth.simulate.material import Material, uniform
 from synth.simulate.space import Space
 from synth.simulate.system import Unknowns

@@ -9,8 +9,8 @@ from enum import IntEnum, IntFlag
 
 import warp as wp
 
+from synth.press.distance import shape_vector
 from synth.simulate.contact import Indenters
-from synth.simulate.distance import shape_vector
 from synth.simulate.policy import requests
 
 

@@ -17,14 +17,14 @@ import warp as wp
 
 from synth.errors import InputError
 from synth.mesh import PadMesh, check_mesh
+from synth.press.indenter import RigidBody
+from synth.press.load_path import LoadPath
+from synth.press.resolution import ELEMENTS
 from synth.scene import Scene
 from synth.simulate.batched.gemm import Dense, call, dense
 from synth.simulate.batched.krylov import Krylov, flat, padded, round_rows
 from synth.simulate.contact import Indenters
-from synth.simulate.indenter import RigidBody
-from synth.simulate.load_path import LoadPath
 from synth.simulate.material import Material, pad_material
-from synth.simulate.resolution import ELEMENTS
 from synth.simulate.space import Space, function_space
 from synth.simulate.system import System
 from synth.simulate.tables import pack_indenter, place_indenter

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from synth.arrays import FloatArray
+from synth.press.press import Press
 from synth.simulate.batched.lanes import Presses
 from synth.simulate.batched.reductions import SCALARS
 from synth.simulate.policy.requests import Record
-from synth.simulate.press import Press
 from synth.simulate.space import Space
 from synth.simulate.tables import struct_of
 from synth.simulate.trajectory import State, Trajectory, at_rest

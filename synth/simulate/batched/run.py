@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from synth.press.press import Press
 from synth.simulate.batched.lane import Lane
 from synth.simulate.batched.lanes import Number
 from synth.simulate.batched.pad import Pad
@@ -13,7 +14,6 @@ from synth.simulate.batched.presses import press_tables, trajectory
 from synth.simulate.batched.solver import INNER_ITERATIONS, BatchedSolver
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.policy.load_steps import LoadSteps
-from synth.simulate.press import Press
 from synth.simulate.solve import check_shared
 from synth.simulate.trajectory import Trajectory, at_rest
 

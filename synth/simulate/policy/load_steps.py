@@ -10,13 +10,13 @@ have to become shorter than SHORTEST_STEP ends at its last good state.
 
 from math import ceil
 
+from synth.press.load_path import TOUCH_MM, LoadPath
+from synth.press.posed_path import IN_GEL, PosedPath
 from synth.scene import Numerics
-from synth.simulate.load_path import TOUCH_MM, LoadPath
 from synth.simulate.options import SolverOptions
 from synth.simulate.policy.multipliers import Passes, allowed_share, polish
 from synth.simulate.policy.newton import Solution, relax, solve
 from synth.simulate.policy.requests import FORCE_FLOOR, Asking, Begin, Do, Evaluation, Record
-from synth.simulate.posed_path import IN_GEL, PosedPath
 from synth.simulate.trajectory import no_contact, not_converged, too_deep
 
 SHORTEST_STEP = 1 / 128

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from synth.simulate.distance import KINDS
-from synth.simulate.indenter import RigidBody
-from synth.simulate.load_path import LoadPath
+from synth.press.distance import KINDS
+from synth.press.indenter import RigidBody
+from synth.press.load_path import LoadPath
 from synth.simulate.policy.newton import Solution, relax, solve
 from synth.simulate.policy.requests import Asking, Augment, Do
 

@@ -4,8 +4,8 @@ import numpy as np
 import warp as wp
 
 from synth.arrays import FloatArray, Points
-from synth.simulate.distance import shape_vector, signed_distance
-from synth.simulate.indenter import RigidBody
+from synth.press.distance import shape_vector, signed_distance
+from synth.press.indenter import RigidBody
 
 
 class Distance:

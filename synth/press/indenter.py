@@ -11,11 +11,11 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.errors import InputError
+from synth.press.distance import KINDS, SHAPE_LENGTH
+from synth.press.object_grid import Grid
 from synth.scene import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus, Vector3
 from synth.scene.indenter import DEFAULT_FILLET_MM
 from synth.scene.surface_file import Triangles, read_surface
-from synth.simulate.distance import KINDS, SHAPE_LENGTH
-from synth.simulate.object_grid import Grid
 
 BLUNT_MM = 1.0
 """Smallest radius at which the contact stiffness of `numerics.penalty` is enough."""
@@ -70,7 +70,7 @@ class RigidBody:
 
     Attributes:
         kind: number of its shape.
-        shape: (SHAPE_LENGTH,) lengths as `synth.simulate.distance.signed_distance` wants them.
+        shape: (SHAPE_LENGTH,) lengths as `synth.press.distance.signed_distance` wants them.
         rotation: (3, 3) its axes as columns, before any twist.
         reach_mm: from its origin along +z to where the depth of a press counts from; of a mesh see LOWERED.
         coefficients: (i, j, k) B-spline coefficients of a mesh's distance grid, else (1, 1, 1) zeros.

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from synth.mesh.face import PadFace, face_of
+from synth.press.indenter import Touchable, rigid_body
+from synth.press.load_path import LoadPath, PressFrame
+from synth.press.posed_path import PosedPath, touchable_at
 from synth.scene import Scene
-from synth.simulate.indenter import Touchable, rigid_body
-from synth.simulate.load_path import LoadPath, PressFrame
-from synth.simulate.posed_path import PosedPath, touchable_at
 
 BULGE, SLACK_MM = 1.5, 1.0
 """Gel beside a contact rises toward the body: no higher than this share of the depth, and so much."""

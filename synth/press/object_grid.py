@@ -1,6 +1,6 @@
 r"""The signed distance of an object, its edges rounded, sampled on a grid for B-splines.
 
-A gel is pressed by what its mesh can follow: sharper edges and notches are rounded, as `synth.simulate.indenter` rounds
+A gel is pressed by what its mesh can follow: sharper edges and notches are rounded, as `synth.press.indenter` rounds
 the edges of analytic shapes. With d the signed distance (negative inside) and S = {d <= 0}, rounding to a radius r is
 an opening, the union of all balls of radius r within S, and then a closing, the same for what is outside:
 
@@ -8,7 +8,7 @@ an opening, the union of all balls of radius r within S, and then a closing, the
 
 A part thinner than 2 r holds no such ball and would be lost, so that what lies farther than LOST r from the opening is
 opened again with half the radius (E_k), and so on down to the grid's spacing. Distances are to triangles: the file's,
-and those of contours that keep their edges (`synth.simulate.object_contour`). The sign of d is that of the generalised
+and those of contours that keep their edges (`synth.press.object_contour`). The sign of d is that of the generalised
 winding number (Jacobson, Kavan & Sorkine-Hornung 2013), which closes holes and fills cavities.
 """
 
@@ -19,8 +19,8 @@ import numpy as np
 import warp as wp
 
 from synth.arrays import BoolArray, FloatArray, Points
+from synth.press.object_contour import crossings, sharp_contour
 from synth.scene.surface_file import Triangles
-from synth.simulate.object_contour import crossings, sharp_contour
 
 STRIDE = 3
 """Far from the surface every STRIDE-th sample along an axis is exact, the others are interpolated."""

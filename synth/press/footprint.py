@@ -19,9 +19,9 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import Focus, face_height
-from synth.simulate.distance import KINDS
-from synth.simulate.load_path import LoadPath, Pose
-from synth.simulate.measure import Distance
+from synth.press.distance import KINDS
+from synth.press.load_path import LoadPath, Pose
+from synth.press.measure import Distance
 
 RESOLUTION = 2e-3
 """The rectangle falls short of the true one, on each side, by at most this fraction of its smaller width."""

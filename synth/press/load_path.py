@@ -3,7 +3,7 @@
 The path parameter is a length in mm: the distance that the farthest touching point moves, leg by leg.
 
 Depth counts from the undeformed face below motion.position_mm: at 0 the indenter's lowest point is level with it (of a
-mesh that point before its edges are rounded to what the gel resolves, see `synth.simulate.indenter.LOWERED`). On a
+mesh that point before its edges are rounded to what the gel resolves, see `synth.press.indenter.LOWERED`). On a
 flat pad that is where it touches, and where the path starts. On a dome a body that comes down beside the apex meets the
 gel toward the apex before that, and one whose lowest points are off its axis (a ring) touches later: there the path
 starts where it first touches the sphere of which the face is a part. Sideways moves keep the level, whatever the face
@@ -25,11 +25,11 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.mesh.cad import CadFace
 from synth.mesh.face import RoundFace, face_height
+from synth.press.distance import KINDS
+from synth.press.indenter import RigidBody, rotation_about
+from synth.press.measure import Distance
 from synth.scene import Motion
 from synth.scene.motion import TWIST_ARM_MM
-from synth.simulate.distance import KINDS
-from synth.simulate.indenter import RigidBody, rotation_about
-from synth.simulate.measure import Distance
 
 TOUCH_MM = 1e-6
 """The path starts so far off the gel, at most."""

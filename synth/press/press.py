@@ -7,11 +7,9 @@ from typing import Literal
 
 from synth.errors import InputError
 from synth.mesh import PadMesh, default_edge_length, pad_mesh
-from synth.scene import MeshIndenter, Scene
-from synth.scene.numerics import MAX_PENALTY
-from synth.simulate.indenter import RigidBody, object_radius
-from synth.simulate.load_path import LoadPath
-from synth.simulate.resolution import (
+from synth.press.indenter import RigidBody, object_radius
+from synth.press.load_path import LoadPath
+from synth.press.resolution import (
     FINER,
     Accuracy,
     Resolution,
@@ -22,7 +20,9 @@ from synth.simulate.resolution import (
     shared_mesh,
     shared_spacing_mm,
 )
-from synth.simulate.scene_path import path_of
+from synth.press.scene_path import path_of
+from synth.scene import MeshIndenter, Scene
+from synth.scene.numerics import MAX_PENALTY
 
 BLUNTER = ((1.5, 1.0), (1.5, 2.0), (2.25, 4.0), (1.8, 3.0), (1.0, 2.0))
 """Factors on the radius of an object's edges and on the contact stiffness, in turn, where its press is incomplete.
@@ -36,7 +36,7 @@ class Press:
     """A fully drawn scene with all that its simulation needs, built once and handed on.
 
     The edges of its body are rounded as stated, or to what the mesh resolves. The accuracy is what the mesh is
-    predicted to give; None where that is left to `synth.simulate.resolution.accuracy`.
+    predicted to give; None where that is left to `synth.press.resolution.accuracy`.
     """
 
     scene: Scene

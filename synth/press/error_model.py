@@ -42,7 +42,7 @@ CERTAINTY = 1.1
 def face_error(scene: Scene, focus: Focus, spacing_mm: float) -> float:
     """E of the error model, mm², of an instance that touches at a focus; 0 for an indenter that does not touch.
 
-    `spacing_mm` is the size of the elements under the contact, as `synth.simulate.resolution` has it.
+    `spacing_mm` is the size of the elements under the contact, as `synth.press.resolution` has it.
     """
     motion, indenter = scene.motion, scene.contact.indenter
     poses = motion.stops.values()

@@ -2,7 +2,7 @@
 
 The mesh is structured and graded around where its indenter will touch: `across` elements across the contact,
 as many through the thickness as keep elements under the contact about as high as wide. It is the cheapest mesh whose
-predicted error is within the budget; the prediction (`synth.simulate.error_model`) was calibrated, and is tested,
+predicted error is within the budget; the prediction (`synth.press.error_model`) was calibrated, and is tested,
 against much finer solutions (docs/reports/budget.md).
 
 Draws of a pad that are simulated many at once share one mesh, wherever their indenters touch: it is even along x and y,
@@ -20,15 +20,15 @@ from typing import NamedTuple
 import numpy as np
 
 from synth.mesh import Counts, Focus, PadMesh, domed, graded_box
+from synth.mesh.element import Element, p1p1, p2p1
 from synth.mesh.face import face_height
 from synth.mesh.graded import spacing
 from synth.optics import Optics
+from synth.press.error_model import face_error
+from synth.press.footprint import footprint
+from synth.press.posed_path import PosedPath
+from synth.press.scene_path import path_of
 from synth.scene import Gel, MeshIndenter, Numerics, Scene
-from synth.simulate.element import Element, p1p1, p2p1
-from synth.simulate.error_model import face_error
-from synth.simulate.footprint import footprint
-from synth.simulate.posed_path import PosedPath
-from synth.simulate.scene_path import path_of
 
 ELEMENTS_ACROSS = (4, 6, 8, 10, 12, 14, 16)
 """Elements across the contact to choose from."""

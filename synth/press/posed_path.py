@@ -1,7 +1,7 @@
 """The load path of an indenter whose poses are given, such as a robot's or a simulator's log of a grasp.
 
 Between two poses its origin moves straight, and it turns about a fixed axis, both evenly. As for other load paths
-(`synth.simulate.load_path`) the path parameter is a length in mm: how far the point of the body moves that is over the
+(`synth.press.load_path`) the path parameter is a length in mm: how far the point of the body moves that is over the
 gel, near its origin, and what the body's turn moves points beside it, leg by leg.
 """
 
@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.mesh.face import face_height
+from synth.press.indenter import Touchable
+from synth.press.load_path import OVER, TOUCH_MM, LoadPath, Pose
+from synth.press.measure import Distance
 from synth.scene import Gel, Motion, Vector3
 from synth.scene.motion import TWIST_ARM_MM
-from synth.simulate.indenter import Touchable
-from synth.simulate.load_path import OVER, TOUCH_MM, LoadPath, Pose
-from synth.simulate.measure import Distance
 
 PAUSE_MM = 1e-6
 """Length of a leg on which nothing moves, so that its end has a place of its own."""
