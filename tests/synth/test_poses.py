@@ -127,10 +127,10 @@ REST = "0,0,0,-4,0,0,0,1\n"
     ("text", "message"),
     [
         ("t,x,y,z,qx,qy,qz,qw\n" + REST, r"line 1: the header is 't,x,y,z.*allowed is time_s,x_mm"),
-        ("", "not a table of poses"),
+        ("", "line 1: the header is .*allowed is time_s"),
         (HEAD + REST + "1,0,0,nan,0,0,0,1\n", "line 3: a pose has 8 finite numbers"),
         (HEAD + REST + "1,0,0,-3,0,0,1\n", "line 3: a pose has 8 finite numbers"),
-        (HEAD + REST + "1,0,0,abc,0,0,0,1\n", "line 3: could not convert"),
+        (HEAD + REST + "1,0,0,abc,0,0,0,1\n", "line 3: a pose has 8 finite numbers"),
         (HEAD + REST + "\n1,0,0,-3,0,0,0,1\n", "line 3: a pose has"),
         (HEAD + REST + "1,0,0,-3,0,0,0,1\n1,0,0,-2,0,0,0,1\n", "line 4: time_s = 1 does not come after 1"),
         (HEAD + REST + "1,0,0,-3,0,0,0,0.5\n", "line 3: the quaternion .* has length 0.5"),
