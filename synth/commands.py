@@ -223,9 +223,7 @@ def export(
     path: Dataset,
     /,
     *,
-    format: Annotated[
-        Literal["flo", "kitti", "npz", "webdataset", "hdf5", "lerobot", "rrd"], Parameter(help="Layout.")
-    ],
+    format: Annotated[Literal["flo", "kitti", "npz", "webdataset", "hdf5", "lerobot", "rrd"], Parameter(help="Layout")],
     out: Annotated[Path, Parameter(help="Directory to write to.")],
     camera: Annotated[str, Parameter(help="Name of a further camera; default: the main one.")] = "",
 ) -> int:
