@@ -54,10 +54,10 @@ def add_clip(out: Path, clips: dict[str, ClipData]) -> None:
     columns |= dict(zip(NUMBERED, ((np.arange(frames) / rate).astype(np.float32), *counted), strict=True))
     features, arrays = {}, {}
     for name, values in columns.items():
-        is_image = name.startswith("observation.images.")
-        arrays[name] = _pictures(pa, values) if is_image else _nested(pa, values)
-        kind, axes = ("image", ["height", "width", "channels"]) if is_image else (str(values.dtype), None)
+        kind = "image" if name.startswith("observation.images.") else str(values.dtype)
+        axes = ["height", "width", "channels"] if kind == "image" else None
         features[name] = {"dtype": kind, "shape": list(values.shape[1:]) or [1], "names": axes}
+        arrays[name] = _array(pa, values, kind)
     episode = {
         "episode_index": number, "tasks": [clip.meta["scene"]["name"]], "length": frames, "dataset_from_index": first,
         "meta": to_document(clip.meta),
@@ -102,16 +102,13 @@ def _columns(clips: dict[str, ClipData]) -> dict[str, NDArray[Any]]:
     return found
 
 
-def _pictures(pa: Any, values: NDArray[Any]) -> Any:
-    files = [{"bytes": encode_png(picture), "path": f"{k:06d}.png"} for k, picture in enumerate(values)]
-    return pa.array(files, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
-
-
-def _nested(pa: Any, values: NDArray[Any]) -> Any:
-    """Arrays (frames, ...) as lists of lists."""
+def _array(pa: Any, values: NDArray[Any], kind: str) -> Any:
+    """Pictures as files, other arrays (frames, ...) as lists of lists."""
+    if kind == "image":
+        files = [{"bytes": encode_png(picture), "path": f"{k:06d}.png"} for k, picture in enumerate(values)]
+        return pa.array(files, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
     found = pa.array(np.ascontiguousarray(values).ravel())
-    for axis in range(values.ndim - 1, 0, -1):
-        step = values.shape[axis]
+    for step in values.shape[:0:-1]:
         found = pa.ListArray.from_arrays(pa.array(np.arange(0, len(found) + 1, step, dtype=np.int32)), found)
     return found
 
