@@ -25,6 +25,7 @@ QUESTIONS = {
     "round_gel": "the flow's error against run time for a round gel, by mesh",
     "synthetic_set": "makes the synthetic test set of the report on gelflow",
     "methods": "flow methods' error against their time on one core, and their sigma",
+    "paper": "the GelFlow paper's table, and its claims one by one",
     "sigma": "is the flow's uncertainty calibrated? fits its constants",
     "pictures": "draws the README's pictures of data",
 }

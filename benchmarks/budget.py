@@ -40,8 +40,8 @@ from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, samples_of, senso
 from synth.scene.template import Template, load_scene, shipped_scenes
 from synth.simulate import Trajectory, simulate
 from synth.simulate.footprint import footprint
-from synth.simulate.newton import MAX_ITERATIONS
 from synth.simulate.options import SolverOptions
+from synth.simulate.policy.newton import MAX_ITERATIONS
 from synth.simulate.press import MeshRule
 from synth.simulate.resolution import (
     ELEMENTS_ACROSS,

@@ -23,9 +23,9 @@ from synth.scene.template import SCENES, load_scene
 from synth.simulate import Trajectory
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
+from synth.simulate.policy.multipliers import DEEP
 from synth.simulate.press import BLUNTER, MeshRule, Press, blunter
 from synth.simulate.solve import simulate_press
-from synth.simulate.stepping import DEEP
 
 
 def drawn(case: Row, settings: Sequence[str] = ()) -> tuple[Press, frozenset[int]] | str:

@@ -37,15 +37,16 @@ from synth.mesh import Counts, Focus, PadMesh, graded_box
 from synth.mesh.tetrahedralise import tetrahedralise_box
 from synth.scene import Scene
 from synth.simulate import Trajectory
+from synth.simulate.direct import DirectPress
 from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.footprint import footprint
 from synth.simulate.material import pad_material
-from synth.simulate.newton import MAX_ITERATIONS
 from synth.simulate.options import STANDARD, SolverOptions
+from synth.simulate.policy.load_steps import LoadSteps
+from synth.simulate.policy.newton import MAX_ITERATIONS
 from synth.simulate.resolution import MARGIN, graded_mesh
 from synth.simulate.scene_path import path_of
 from synth.simulate.space import function_space
-from synth.simulate.stepping import Stepper
 from synth.simulate.system import System
 
 PX_PER_MM = 17.2
@@ -134,14 +135,15 @@ def mesh_of(mesh: tuple[Any, ...], scene: Scene) -> PadMesh:
     return graded_box(PAD_MM, whole, Counts((sizes[0] - 2, sizes[1] - 2), (1, 1), sizes[2], growth=1.0))
 
 
-def stepper_of(scene: Scene, mesh: PadMesh, setting: Setting) -> Stepper:
+def press_of(scene: Scene, mesh: PadMesh, setting: Setting) -> DirectPress:
     """A case at the start of its path, with elements and contact points that scenes do not offer, too."""
     numerics = scene.numerics.model_copy(update=setting.numerics)
     space = function_space(mesh, ELEMENTS[setting.element](setting.contact_split))
     gel, options = scene.sensor.gel, setting.options
     system = System(space, pad_material(gel, mesh), numerics.penalty, options=options)
     path = path_of(scene, None, mesh.spacing_mm / (2 * space.element.order))
-    return Stepper(system, path, scene.contact.friction, numerics, gel.youngs_modulus_kpa / 1000, options)
+    steps = LoadSteps(path, mesh.size_mm, scene.contact.friction > 0, numerics, options)
+    return DirectPress(system, path, scene.contact.friction, gel.youngs_modulus_kpa / 1000, steps)
 
 
 def forces(trajectory: Trajectory, states: list[int]) -> np.ndarray:
@@ -173,7 +175,7 @@ def reference(case: str, across: int) -> Trajectory:
     """
     setting = Setting("reference", ("wide", across, 5), options=SolverOptions(correction_iterations=MAX_ITERATIONS))
     scene = CASES[case]
-    found = stepper_of(scene, mesh_of(setting.mesh, scene), setting).run()
+    found = press_of(scene, mesh_of(setting.mesh, scene), setting).run()
     deepest = max(state.max_penetration_mm for state in found.states)
     if found.status != "complete" or deepest > LARGEST_PENETRATION_MM:
         raise RuntimeError(f"the reference of {case} is {found.status}, {deepest:.2g} mm in the ball")
@@ -184,7 +186,7 @@ def reference(case: str, across: int) -> Trajectory:
 def compile_kernels(element: str, contact_split: int) -> None:
     """Press once on a coarse mesh, so that compilation is not timed."""
     scene, setting = CASES["centred"], Setting("", ("graded", 2, 2), element, contact_split)
-    stepper_of(scene, mesh_of(setting.mesh, scene), setting).run()
+    press_of(scene, mesh_of(setting.mesh, scene), setting).run()
 
 
 def press(case: Row, settings: dict[tuple[str, str], Setting]) -> Row:
@@ -193,11 +195,11 @@ def press(case: Row, settings: dict[tuple[str, str], Setting]) -> Row:
     truth = reference(case["case"], case["reference"])
     mesh = mesh_of(setting.mesh, scene)
     compile_kernels(setting.element, setting.contact_split)
-    found, seconds = timed(lambda: stepper_of(scene, mesh, setting).run())
+    found, seconds = timed(lambda: press_of(scene, mesh, setting).run())
     complete = found.status == "complete"
     return {
         "status": found.status,
-        "unknowns": len(stepper_of(scene, mesh, setting).system.free),
+        "unknowns": len(press_of(scene, mesh, setting).system.free),
         "seconds": round(seconds, 3),
         "iterations": sum(state.newton_iterations for state in found.states),
         **(errors(found, truth, COUNTED[case["case"]]) if complete else {}),

@@ -26,10 +26,10 @@ from synth.scene.sampling import draw
 from synth.scene.template import checked_template, load_scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.footprint import footprint
+from synth.simulate.policy.multipliers import DEEP
 from synth.simulate.press import MeshRule
 from synth.simulate.resolution import MARGIN, graded_mesh
 from synth.simulate.scene_path import path_of
-from synth.simulate.stepping import DEEP
 
 SIZE_MM = 8.0
 BALL = Sphere(shape="sphere", radius_mm=4.0)

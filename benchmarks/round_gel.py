@@ -28,7 +28,7 @@ from synth.scene import Scene
 from synth.scene.template import load_scene
 from synth.simulate import Trajectory
 from synth.simulate.press import Press
-from synth.simulate.solve import simulate_press, stepper_of
+from synth.simulate.solve import direct_press, simulate_press
 from synth.surface import GelSurface
 
 SETTINGS = (
@@ -82,7 +82,7 @@ def main(argv: list[str]) -> int:
 
     def solved(family: str, edge_mm: float) -> tuple[Trajectory, float, int]:
         press = Press.of(scene, mesh_of(scene, family, edge_mm))
-        found, seconds = timed(lambda: stepper_of(press).run() if family == "whole" else simulate_press(press))
+        found, seconds = timed(lambda: direct_press(press).run() if family == "whole" else simulate_press(press))
         assert found.status == "complete", found.reason
         return found, seconds, len(press.mesh.tets)
 

@@ -41,3 +41,6 @@ AsJson = Annotated[bool, Parameter("--json", negative=(), help="Print the answer
 Dataset = Annotated[Path, Parameter(help="A dataset directory.")]
 
 DEFAULT_SCENE = "gelsight_mini"
+Format = Annotated[
+    Literal["flo", "kitti", "npz", "webdataset", "hdf5", "lerobot", "rrd"], Parameter(help="Layout to write.")
+]

@@ -6,14 +6,14 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
-from synth.cli_options import DEFAULT_SCENE, AsJson, Assignments, Dataset, Device, SceneName, whole
+from synth.cli_options import DEFAULT_SCENE, AsJson, Assignments, Dataset, Device, Format, SceneName, whole
 from synth.errors import InputError, printable
 
 if TYPE_CHECKING:
@@ -38,9 +38,9 @@ def generate(
         int | None,
         Parameter(
             converter=whole(1),
-            help="Processes that make samples, on one core each; the samples are the same. Default: on a GPU one for "
-            "each core beside this process's, else none: this process makes them and renders on all cores. With the "
-            "batched solver this process simulates, and 1 is for no others.",
+            help="Processes that make samples, on one core each; the samples are the same. Default: one a core as far "
+            "as memory holds them (beside this process, which simulates, on a GPU), or none for a short job. With the "
+            "batched solver 1 is for no others.",
         ),
     ] = None,
     ray: Annotated[
@@ -223,7 +223,7 @@ def export(
     path: Dataset,
     /,
     *,
-    format: Annotated[Literal["flo", "kitti", "npz", "webdataset", "hdf5", "lerobot", "rrd"], Parameter(help="Layout")],
+    format: Format,
     out: Annotated[Path, Parameter(help="Directory to write to.")],
     camera: Annotated[str, Parameter(help="Name of a further camera; default: the main one.")] = "",
 ) -> int:

@@ -1,6 +1,6 @@
 """Scheduling: which trajectories are still to do, who does them, and what happened.
 
-Without a GPU in this process by default, which renders on all cores; with workers, in processes of one core each
+Few trajectories in this process, which renders on all cores; more of them in worker processes of one core each
 (`worker_pool`); with Ray, on a cluster (`ray_pool`); or one shard of the job, beside others, such as those of several
 GPUs (`devices`). With the batched solver this process simulates, and the workers do the rest (`overlapped`).
 
@@ -8,6 +8,7 @@ The driver alone writes manifest and failures; samples' folders are written wher
 on where it stopped.
 """
 
+import os
 import sys
 import time
 from collections import Counter
@@ -38,7 +39,7 @@ from synth.pipeline.producer import Producer
 from synth.pipeline.ray_pool import outcomes_of_ray
 from synth.pipeline.records import JobContext, Outcome, Task
 from synth.pipeline.worker_pool import cores, outcomes_of_processes
-from synth.planning import Plan, plan
+from synth.planning import Plan, plan, predict
 from synth.render.variant import Variant
 from synth.scene import Gel
 from synth.scene.sampling import draw_sensor, sensor_of
@@ -46,6 +47,8 @@ from synth.scene.template import Template
 
 SOLVER_BYTES, WORKER_BYTES = 6 * 2**30, 2 * 2**30
 """GPU memory of the batched solver, and of a worker that renders."""
+WORTH_A_WORKER = 4
+"""Trajectories a core from which on worker processes, which take seconds to start, make them sooner."""
 PACKAGES = ("mitsuba", "drjit", "warp-lang", "pytetwild", "pypardiso", "numpy", "scipy", "OpenEXR")
 
 
@@ -55,8 +58,9 @@ class Scheduling:
 
     Attributes:
         workers: processes that make samples, on one core each; None: with a GPU, as many as there are cores beside
-            this process's and as the GPU's memory holds, else this process alone, which renders on all cores. With
-            the batched solver 1 is for none. With Ray: tasks at once, None for all cores of the cluster.
+            this process's and as the GPU's memory holds; else one a core, as far as half of the memory holds them, or
+            this process alone where there are few trajectories. With the batched solver 1 is for none. With Ray:
+            tasks at once, None for all cores of the cluster.
         ray: address of a Ray cluster, or "local".
         shard: make this part of the job only.
         batch: most trajectories that the batched solver has under way at a time; None for what suits the device.
@@ -209,7 +213,8 @@ def generate(
         found = sum(i < n and shard.makes(i // count) for i in finished)
         summary = Summary(out, str(shard) if scheduling.shard else None, asked, found)
         tasks, warned = _tasks(context, writer, n, finished, shard), False
-        with closing(_outcomes(context, tasks, scheduling)) as outcomes:
+        left = -(-(asked - found) // count)
+        with closing(_outcomes(context, tasks, scheduling, left)) as outcomes:
             for outcome in outcomes:
                 for failure in outcome.failures:
                     writer.fail(failure)
@@ -297,11 +302,13 @@ def _store_mesh(context: JobContext, writer: DatasetWriter, gel: Gel) -> None:
             raise InputError(f"{stored}: the mesh cannot be written; put this right and give the same command again")
 
 
-def _outcomes(context: JobContext, tasks: Iterator[Task], scheduling: Scheduling) -> Generator[Outcome, None, None]:
+def _outcomes(
+    context: JobContext, tasks: Iterator[Task], scheduling: Scheduling, left: int
+) -> Generator[Outcome, None, None]:
     if scheduling.ray is not None:
         yield from outcomes_of_ray(context, tasks, scheduling.ray, scheduling.workers)
         return
-    workers = scheduling.workers or _workers_of_gpu(context)
+    workers = scheduling.workers or _workers_here(context, left)
     if context.plan.is_batched:
         yield from outcomes_of_batches(context, tasks, workers or 1, scheduling.batch)
     elif workers is not None:
@@ -312,10 +319,15 @@ def _outcomes(context: JobContext, tasks: Iterator[Task], scheduling: Scheduling
             yield producer.produce(*task)
 
 
-def _workers_of_gpu(context: JobContext) -> int | None:
-    """Worker processes that share a GPU, as many as its memory holds; None where nothing is rendered on one."""
-    if not context.plan.variant.is_on_gpu or not is_shared(context.out):
+def _workers_here(context: JobContext, trajectories: int) -> int | None:
+    """Worker processes for so many trajectories that share a GPU or the cores; None where this process does it."""
+    if not is_shared(context.out):
         return None
+    if not context.plan.variant.is_on_gpu:
+        if context.plan.is_batched or cores() == 1 or trajectories < WORTH_A_WORKER * cores():
+            return None
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        return min(cores(), memory // 2 // predict(context.plan).memory_bytes) or None
     from synth.warp_start import start_warp
 
     start_warp()

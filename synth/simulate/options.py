@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """Settings of `synth.simulate.stepping.Stepper` and of the batched solver.
+    """Settings of `synth.simulate.policy` and of the batched solver.
 
     Attributes:
         relaxed_tolerance: tolerance of intermediate steps, also of recorded states that are not wanted. Without

@@ -10,14 +10,15 @@ from synth.arrays import BoolArray, FloatArray
 from synth.errors import InputError
 from synth.mesh import PadMesh, check_mesh, face_of
 from synth.scene import Gel, Scene
+from synth.simulate.direct import DirectPress
 from synth.simulate.load_path import LoadPath
 from synth.simulate.material import pad_material
 from synth.simulate.measure import Distance
 from synth.simulate.options import STANDARD, SolverOptions
+from synth.simulate.policy.load_steps import LoadSteps
 from synth.simulate.press import Press
 from synth.simulate.resolution import ELEMENTS
 from synth.simulate.space import Space, function_space
-from synth.simulate.stepping import Stepper
 from synth.simulate.system import System
 from synth.simulate.trajectory import State, Trajectory
 
@@ -58,23 +59,24 @@ def simulate_press(
     """
     gel, whole = press.scene.sensor.gel, space_of(press)
     if not (gel.is_round and press.path.may_touch):
-        return stepper_of(press, frames, options, whole).run(on_progress)
+        return direct_press(press, frames, options, whole).run(on_progress)
     # A film pulls as far as its shear lag, √(E t h / G) with the gel's thickness h and G = E / 3 of the gel.
     film = sum(layer.youngs_modulus_kpa * layer.thickness_mm for layer in gel.layers) / gel.youngs_modulus_kpa
     near = Vicinity(whole, press.path, max(gel.depth_mm, (3 * film * gel.depth_mm) ** 0.5))
-    found = stepper_of(press, frames, options, near.space).run(on_progress)
+    found = direct_press(press, frames, options, near.space).run(on_progress)
     return replace(found, states=tuple(map(near.widened, found.states)), space=whole)
 
 
-def stepper_of(
+def direct_press(
     press: Press, frames: frozenset[int] | None = None, options: SolverOptions = STANDARD, space: Space | None = None
-) -> Stepper:
+) -> DirectPress:
     """A press at the start of its load path, on a part of its gel's space, default all of it; see `simulate_press`."""
     scene, gel, numerics = press.scene, press.scene.sensor.gel, press.scene.numerics
     space = space or space_of(press)
     system = System(space, pad_material(gel, space.mesh), numerics.penalty, options)
     modulus_mpa = gel.youngs_modulus_kpa / 1000
-    return Stepper(system, press.path, scene.contact.friction, numerics, modulus_mpa, options, frames)
+    steps = LoadSteps(press.path, space.mesh.size_mm, scene.contact.friction > 0, numerics, options, frames)
+    return DirectPress(system, press.path, scene.contact.friction, modulus_mpa, steps)
 
 
 def space_of(press: Press) -> Space:

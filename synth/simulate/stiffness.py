@@ -61,7 +61,7 @@ def bulk_tangent(
 
     Adds them to the entries slot[e, pair, 3 i + j] of the sparse values; entries of held unknowns and below the
     diagonal share one slot past the end. laplace: (m, pairs) of `synth.simulate.tables.laplace_table`; so many times
-    it is added again as the sample's viscosity (B,) says, see `synth.simulate.newton`.
+    it is added again as the sample's viscosity (B,) says, see `synth.simulate.policy.newton`.
     """
     s, e = wp.tid()
     if active[s] == 0:

@@ -52,12 +52,21 @@ class Unknowns:
 class Residual:
     """Residual of the equilibrium equations: (k,) of the unknowns that are not held; meaningless where det F <= 0.
 
-    `nodal_forces` (n, 3), E mm², are those on all nodes; on held ones they are the reaction.
+    `nodal_forces` (n, 3), E mm², are those on all nodes; on held ones they are the reaction. At the contact points, as
+    Warp arrays (1, f, nq): `gap`, mm; `traction` on the gel and its tangential part, world axes, in units of E.
     """
 
     free: FloatArray
     nodal_forces: FloatArray
     smallest_jacobian: float
+    gap: wp.array
+    tangential: wp.array
+    traction: wp.array
+
+    @property
+    def deepest(self) -> float:
+        """Largest penetration, mm."""
+        return max(0.0, -float(self.gap.numpy().min()))
 
 
 @dataclass(frozen=True)
@@ -109,12 +118,9 @@ class System:
 
     def _allocate(self) -> None:
         element, count = self.space.element, len(self.space.nodes)
-        points = (1, len(self.space.faces), len(element.face_weights))
+        self._points = points = (1, len(self.space.faces), len(element.face_weights))
         self.contact: ContactState = zeros_of(ContactState, lambda _: points, "cpu")
         self.contact.gap.fill_(FAR)
-        self.gap = wp.full(points, FAR, dtype=wp.float64, device="cpu")
-        self.tangential = _zeros(points, wp.vec3d)
-        self.traction = _zeros(points, wp.vec3d)
         self._stiffness = _zeros(points, wp.mat33d)
         self._remainder = _zeros(points, wp.mat33d)
         self._touching = _zeros(points[:2], wp.int32)
@@ -122,13 +128,12 @@ class System:
         self._factor, self._held = _zeros(at_points, wp.vec4d), _zeros(at_points, wp.vec4d)
         at_nodes = (*at_points, self.space.nodes.shape[1])
         self._pushed, self._drift = _zeros(at_nodes, wp.vec3d), _zeros(at_nodes, wp.vec3d)
-        self._values = _zeros((1, self._pattern.size + 1), wp.float64)
 
     def zero(self) -> Unknowns:
         return Unknowns(np.zeros((len(self.space.points), 3)), np.zeros(self.space.pressures if self.mixed else 0))
 
     def residual(self, state: Unknowns, indenter: Indenters) -> Residual:
-        """Residual of a state; the gaps and tractions of its contact points are kept for what is asked next."""
+        """Residual of a state, with what contact does at its points."""
         u, p = _on_device(state)
         elements = (1, len(self.space.nodes))
         force, volume = _zeros((1, len(self.space.points)), wp.vec3d), _zeros((1, len(state.p)), wp.float64)
@@ -137,10 +142,11 @@ class System:
         if self._barrier is not None:
             _launch(barrier_residual, elements, u, self._active, self._barrier, force, jacobian)
         contact = [u, self._active, self._faces, indenter, self.contact, self.penalty]
-        _launch(contact_residual, self.gap.shape[:2], *contact, force, self.gap, self.tangential, self.traction)
+        at_points = [wp.empty(self._points, dtype=dtype, device="cpu") for dtype in (wp.float64, wp.vec3d, wp.vec3d)]
+        _launch(contact_residual, self._points[:2], *contact, force, *at_points)
         reaction = force.numpy()[0]
         full = np.concatenate([reaction.ravel(), volume.numpy()[0]])
-        return Residual(full[self.free], reaction, float(jacobian.numpy().min()))
+        return Residual(full[self.free], reaction, float(jacobian.numpy().min()), *at_points)
 
     def tangent(self, state: Unknowns, indenter: Indenters, viscosity: float = 0.0, turn: float = np.inf) -> Tangent:
         """Derivative of the free residual, plus viscosity times `viscous_force`'s; turn: `contact_stiffness`'s most."""
@@ -148,37 +154,37 @@ class System:
         active, elements = self._active, (1, len(self.space.nodes))
         thick = _array(np.array([viscosity]), wp.float64)
         factor, held, pushed, drift = self._factor, self._held, self._pushed, self._drift
-        self._values.zero_()
+        values = _zeros((1, self._pattern.size + 1), wp.float64)
         _launch(linearise, elements, u, p, active, self._bulk, factor, held, pushed, drift)
         bulk = [active, self._bulk, self._laplace, thick, factor, pushed, drift, self._block_slot]
-        _launch(bulk_tangent, elements, *bulk, self._values)
+        _launch(bulk_tangent, elements, *bulk, values)
         if self._barrier is not None:
-            _launch(barrier_tangent, elements, u, active, self._barrier, self._pairs, self._block_slot, self._values)
+            _launch(barrier_tangent, elements, u, active, self._barrier, self._pairs, self._block_slot, values)
         if self.mixed:
             slots = [self._coupling_slot, self._pressure_slot]
-            _launch(pressure_tangent, elements, active, self._bulk, held, pushed, *slots, self._values)
+            _launch(pressure_tangent, elements, active, self._bulk, held, pushed, *slots, values)
         contact = [u, active, self._faces, indenter, self.contact, self.penalty]
-        faces = self.gap.shape[:2]
-        _launch(contact_stiffness, faces, *contact, turn, self._touching, self._stiffness, self._remainder)
-        blocks = [self._faces, self._face_pairs, self._touching, self._stiffness, self._face_slot]
-        _launch(contact_tangent, (*faces, len(self._pattern.face_pairs)), *blocks, self._values)
-        return Tangent(self._values.numpy()[0, :-1], self._unsymmetric())
+        faces, touching, remainder = self._points[:2], self._touching, self._remainder
+        _launch(contact_stiffness, faces, *contact, turn, touching, self._stiffness, remainder)
+        blocks = [self._faces, self._face_pairs, touching, self._stiffness, self._face_slot]
+        _launch(contact_tangent, (*faces, len(self._pattern.face_pairs)), *blocks, values)
+        return Tangent(values.numpy()[0, :-1], self._unsymmetric(touching.numpy()[0], remainder.numpy()[0]))
 
     def viscous_force(self, before: Unknowns, after: Unknowns, viscosity: float) -> FloatArray:
-        """(k,) force on the free unknowns against a step with a viscosity, see `synth.simulate.newton`."""
+        """(k,) force on the free unknowns against a step with a viscosity, see `synth.simulate.policy.newton`."""
         force = _zeros((1, len(self.space.points)), wp.vec3d)
         (old, _), (new, _) = _on_device(before), _on_device(after)
         thick = _array(np.array([viscosity]), wp.float64)
         _launch(viscous_force, (1, len(self.space.nodes)), self._active, old, new, thick, self._bulk, force)
         return np.asarray(np.concatenate([force.numpy().ravel(), np.zeros_like(before.p)])[self.free])
 
-    def _unsymmetric(self) -> Any:
-        """What contact leaves over as a sparse matrix, or None where nothing is."""
-        rubbing = np.flatnonzero(self._touching.numpy()[0] == 2)
+    def _unsymmetric(self, touching: np.ndarray, remainder: FloatArray) -> Any:
+        """What contact leaves over (`contact_stiffness`) as a sparse matrix, or None where nothing is."""
+        rubbing = np.flatnonzero(touching == 2)
         if len(rubbing) == 0:
             return None
         shape, weight = self.space.element.face_shape, self._faces.weight.numpy()[rubbing]
-        blocks = weight[:, :, None, None] * self._remainder.numpy()[0, rubbing]
+        blocks = weight[:, :, None, None] * remainder[rubbing]
         pairs = np.einsum("qa,qb->qab", shape, shape).reshape(len(shape), -1)
         count, nodes = len(rubbing), shape.shape[1]
         dense = np.matmul(pairs.T, blocks.reshape(count, len(shape), 9)).reshape(count, nodes, nodes, 3, 3)
@@ -201,16 +207,18 @@ class System:
         full[self.free] = -self._linear_solver.solve(matrix, tangent.remainder, residual, rough, reuse)
         return Unknowns(full[:moves].reshape(-1, 3), full[moves:])
 
-    def augment(self, indenter: Indenters, share: float = 1.0) -> None:
-        """Augmented-Lagrangian update at the last residual: a share of it, 1 for all of it."""
+    def augment(self, at: Residual, indenter: Indenters, share: float = 1.0) -> None:
+        """Augmented-Lagrangian update at a solution, by its residual: a share of it, 1 for all of it."""
         amount = _array(np.array([share]), wp.float64)
-        _launch(augment, self.gap.shape, amount, indenter, self.gap, self.tangential, self.penalty, self.contact)
+        _launch(augment, self._points, amount, indenter, at.gap, at.tangential, self.penalty, self.contact)
 
-    def update_contact_history(self, state: Unknowns, indenter: Indenters, new_only: int = 0) -> None:
-        """Accept a step: friction's anchors follow. If new_only, points that touch for the first time are anchored."""
-        at_last = [indenter, self.gap, self.tangential, self.penalty]
-        u = _on_device(state)[0]
-        _launch(update_contact_history, self.gap.shape, u, self._active, self._faces, *at_last, new_only, self.contact)
+    def update_contact_history(self, state: Unknowns, at: Residual, indenter: Indenters, new_only: int = 0) -> None:
+        """Accept a step: friction's anchors follow. If new_only, points that touch for the first time are anchored.
+
+        `at` is the residual of the state.
+        """
+        where, found = [self._active, self._faces, indenter], [at.gap, at.tangential, self.penalty]
+        _launch(update_contact_history, self._points, _on_device(state)[0], *where, *found, new_only, self.contact)
 
     def saved_contact(self) -> dict[str, np.ndarray]:
         """Copies of what contact remembers, by their names in `ContactState`."""
@@ -221,29 +229,25 @@ class System:
         for name, before in saved.items():
             getattr(self.contact, name).assign(before)
 
-    def deepest(self) -> float:
-        """Largest penetration at the last residual, mm."""
-        return max(0.0, -float(self.gap.numpy().min()))
-
-    def slip_ratio(self, indenter: Indenters) -> float:
-        """Share of the touching area that slips at the last residual: all without friction, 0 without contact."""
-        weight, traction = self._faces.weight.numpy(), self.traction.numpy()[0]
-        along = np.linalg.norm(self.tangential.numpy()[0], axis=2)
+    def slip_ratio(self, at: Residual, indenter: Indenters) -> float:
+        """Share of the touching area that slips: all without friction, 0 without contact."""
+        weight, traction = self._faces.weight.numpy(), at.traction.numpy()[0]
+        along = np.linalg.norm(at.tangential.numpy()[0], axis=2)
         pressure = np.sqrt(np.maximum((traction**2).sum(axis=2) - along**2, 0.0))
         touching = pressure > 0
         slipping = touching & (along >= (1 - 1e-6) * (indenter.friction.numpy()[0] * pressure))
         area = float((weight * touching).sum())
         return float((weight * slipping).sum()) / area if area > 0 else 0.0
 
-    def forces(self, state: Unknowns) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Force, moment and traction of the indenter on the gel at the last residual, in units of E.
+    def forces(self, state: Unknowns, at: Residual) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Force, moment and traction of the indenter on the gel in a state with this residual, in units of E.
 
         (3,) force in E mm²; (3,) moment about the frame's origin in E mm³; (s, 3) traction at the nodes of the coated
         surface (E, per undeformed area), the mean of the quadrature points near a node, weighted by the node's
         piecewise linear function.
         """
         shape, weight = self.space.element.face_shape, self._faces.weight.numpy()
-        traction = self.traction.numpy()[0]
+        traction = at.traction.numpy()[0]
         arm = np.einsum("qa,fac->fqc", shape, (self.space.points + state.u)[self.space.faces])
         force = np.einsum("fq,fqc->c", weight, traction)
         moment = np.einsum("fq,fqc->c", weight, np.cross(arm, traction))

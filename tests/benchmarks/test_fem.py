@@ -9,7 +9,7 @@ import pytest
 from commands import said
 
 from benchmarks import fem
-from benchmarks.fem import CASES, PLAIN, PX_PER_MM, Setting, errors, mark_best, mesh_of, press, settings_of, stepper_of
+from benchmarks.fem import CASES, PLAIN, PX_PER_MM, Setting, errors, mark_best, mesh_of, press, press_of, settings_of
 from benchmarks.press import PAD_MM, ball_scene, face_displacement, face_grid, timed
 from benchmarks.rows import Row, read
 from synth.simulate import Trajectory
@@ -21,7 +21,7 @@ COARSE = {"max_step_mm": 0.5}
 @pytest.fixture(scope="module")
 def shallow() -> Trajectory:
     setting = Setting("", ("graded", 2), "P1/P1", numerics=COARSE)
-    return stepper_of(SHALLOW, mesh_of(setting.mesh, SHALLOW), setting).run()
+    return press_of(SHALLOW, mesh_of(setting.mesh, SHALLOW), setting).run()
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def test_the_command(one_case: None, tmp_path: Path, monkeypatch, capsys: pytest
     meshes = [Setting("graded P2/P1", ("graded", n, 2), numerics=COARSE) for n in (2, 4)]
     ways = [Setting("plain solver", ("graded", 2, 2), numerics=COARSE, options=PLAIN), *meshes]
     wide = Setting("", ("wide", 8, 2))
-    reference = stepper_of(SHALLOW, mesh_of(wide.mesh, SHALLOW), wide).run()
+    reference = press_of(SHALLOW, mesh_of(wide.mesh, SHALLOW), wide).run()
     monkeypatch.setattr(fem, "settings_of", lambda every, across: {"shallow": ways})
     monkeypatch.setattr(fem, "reference", lambda case, across: reference)
     assert "graded 4 2" in said(capsys, fem.main, "--out", tmp_path)
@@ -83,7 +83,7 @@ def test_the_command(one_case: None, tmp_path: Path, monkeypatch, capsys: pytest
 
 def test_references_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch, shallow: Trajectory) -> None:
     lost = replace(shallow, reason="lost")
-    monkeypatch.setattr(fem, "stepper_of", lambda *_: type("Ended", (), {"run": lambda self: lost})())
+    monkeypatch.setattr(fem, "press_of", lambda *_: type("Ended", (), {"run": lambda self: lost})())
     with pytest.raises(RuntimeError, match="is partial"):
         fem.reference.__wrapped__("centred", 8)
 

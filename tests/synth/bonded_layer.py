@@ -22,7 +22,7 @@ from collections.abc import Callable
 from functools import cache, partial
 
 import numpy as np
-from pads import indenters, mapped, scene, supported
+from pads import found_by_newton, indenters, mapped, scene, supported
 from scipy.optimize import brentq
 
 from synth.arrays import BoolArray, FloatArray, Points
@@ -30,8 +30,7 @@ from synth.mesh import PadMesh
 from synth.simulate.contact import Indenters
 from synth.simulate.element import Element
 from synth.simulate.material import uniform
-from synth.simulate.newton import relative_residual, solve
-from synth.simulate.system import System, Unknowns
+from synth.simulate.system import System
 
 POINTS = 64  # Gauss points over the contact radius: up to a = 10 h the force keeps 11 digits when they are doubled
 CUTOFF = 30.0  # 1 - L(x) is 4 x² exp(-2x) at large x: 3e-23 at 30
@@ -155,16 +154,16 @@ def lowered(shape: dict[str, object], depth: float, thickness: float) -> Indente
 
 def press(quarter: System, indenter: Indenters, penalties: tuple[float, ...] = (20.0, 200.0)) -> float:
     """Force of the whole layer over E, mm²: at rising penalties, then with updates that leave less than 0.5 % of it."""
-    state: Unknowns = quarter.zero()
+    state, residual = quarter.zero(), quarter.residual(quarter.zero(), indenter)
     for k in range(len(penalties) + 2):
         if k < len(penalties):
             quarter.penalty = penalties[k]
         else:
-            quarter.augment(indenter)
-        solution = solve(quarter, state, indenter, TOLERANCE)
-        assert solution.converged, f"solve {k}: residual {relative_residual(solution.residual):.1e}"
-        state = solution.state
-    return 4 * float(quarter.forces(state)[0][2])
+            quarter.augment(residual, indenter)
+        solution = found_by_newton(quarter, state, indenter, TOLERANCE)
+        assert solution.converged, f"solve {k}: residual {solution.relative:.1e}"
+        state, residual = solution.state, solution.residual
+    return 4 * float(quarter.forces(state, residual)[0][2])
 
 
 def ball_ratio(element: Element, poisson_ratio: float, radius: float, depth: float, cells: int) -> float:

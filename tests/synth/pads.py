@@ -7,7 +7,7 @@ start, so that prescribed motion is a `held` mask and a start; dead loads are no
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +22,17 @@ from synth.simulate import Trajectory, simulate
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
 from synth.simulate.contact import Indenters
+from synth.simulate.direct import DirectPress, DirectSolver, led
 from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.indenter import rigid_body
 from synth.simulate.load_path import LoadPath
 from synth.simulate.material import Material, uniform
-from synth.simulate.newton import relative_residual, solve
 from synth.simulate.options import SolverOptions
+from synth.simulate.policy import newton
+from synth.simulate.policy.requests import Do
 from synth.simulate.press import Press
-from synth.simulate.solve import stepper_of
+from synth.simulate.solve import direct_press
 from synth.simulate.space import Space, function_space
-from synth.simulate.stepping import Stepper
 from synth.simulate.system import Residual, System, Tangent, Unknowns
 from synth.simulate.tables import pack_indenter, place_indenter
 from synth.surface import ContactFaces
@@ -129,13 +130,13 @@ def system(mesh: PadMesh, poisson_ratio: float, penalty: float = 50.0, element: 
     return System(space, uniform(len(mesh.tets), poisson_ratio), penalty)
 
 
-def run(posed: Scene, mesh: PadMesh) -> Stepper:
-    """A stepper at the end of a scene's path, which it must have reached."""
+def run(posed: Scene, mesh: PadMesh) -> DirectPress:
+    """A press at the end of a scene's path, which it must have reached."""
     # The full tolerance for all steps: the state in which the path ends is looked at, beside the recorded ones.
-    stepper = stepper_of(Press.of(posed, mesh), options=SolverOptions(relaxed_tolerance=0.0))
-    ended = stepper.run()
+    press = direct_press(Press.of(posed, mesh), options=SolverOptions(relaxed_tolerance=0.0))
+    ended = press.run()
     assert (ended.status, ended.reason) == ("complete", "")
-    return stepper
+    return press
 
 
 def presses_of(scenes: Sequence[Scene], mesh: PadMesh, folder: Path | None = None) -> list[Press]:
@@ -202,6 +203,29 @@ class LoadedSystem(System):
         return replace(found, free=found.free - full[self.free], nodal_forces=found.nodal_forces - self.load)
 
 
+@dataclass(frozen=True)
+class Found:
+    """Where Newton's method ended."""
+
+    state: Unknowns
+    residual: Residual
+    relative: float
+    converged: bool
+    iterations: int
+
+
+def found_by_newton(
+    body: System, start: Unknowns, indenter: Indenters, tolerance: float, limit: int = 20, reach_mm: float = np.inf
+) -> Found:
+    """Newton's method from a state."""
+    solver = DirectSolver(body, indenter)
+    at = solver.start(start)
+    solver.answer(Do.KEEP_PASS)
+    solution = led(newton.solve(at, tolerance, limit, reach_mm), solver.answer)
+    last = solver.iterate
+    return Found(last.state, last.residual, solution.at.relative, solution.converged, solution.iterations)
+
+
 def equilibrium(
     space: Space,
     material: Material,
@@ -223,8 +247,8 @@ def equilibrium(
         body.load = np.zeros_like(space.points) if load is None else load * (k / steps)
         ahead = state.plus(Unknowns(state.u - before.u, state.p - before.p), 1.0)
         start = Unknowns(np.where(space.held, goal * (k / steps), ahead.u), ahead.p)
-        solution = solve(body, start, far_away(), tolerance)
-        assert solution.converged, f"step {k} of {steps}: residual {relative_residual(solution.residual):.1e}"
+        solution = found_by_newton(body, start, far_away(), tolerance)
+        assert solution.converged, f"step {k} of {steps}: residual {solution.relative:.1e}"
         before, state = state, solution.state
     return body, state, body.residual(state, far_away()).nodal_forces
 

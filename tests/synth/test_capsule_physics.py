@@ -25,7 +25,7 @@ from synth.simulate.element import p2p1
 from synth.simulate.material import pad_material
 from synth.simulate.press import MeshRule, Press
 from synth.simulate.scene_path import path_of
-from synth.simulate.solve import stepper_of
+from synth.simulate.solve import direct_press
 from synth.simulate.space import function_space
 from synth.simulate.system import Unknowns
 
@@ -141,7 +141,7 @@ def test_far_from_the_press_the_gel_is_left_out() -> None:
     thin = {"thickness_mm": 0.8, "length_mm": 9.0, "layers": [{"thickness_mm": 0.1, "youngs_modulus_kpa": 2000.0}]}
     posed = capsule(thin, friction=0.5, motion=motion, numerics={"element": "p1p1", "edge_length_mm": 0.8})
     mesh = capsule_mesh(posed.sensor.gel, 0.8)
-    near, whole = simulate(posed, mesh), stepper_of(Press.of(posed, mesh)).run()
+    near, whole = simulate(posed, mesh), direct_press(Press.of(posed, mesh)).run()
     found, true = near.states[-1], whole.states[-1]
     moved = np.linalg.norm(true.displacement, axis=1)
     np.testing.assert_allclose(found.displacement, true.displacement, atol=0.01 * moved.max())

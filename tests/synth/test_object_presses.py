@@ -15,11 +15,21 @@ from synth.errors import InputError
 from synth.mesh import Counts, Focus, graded_box
 from synth.scene import Scene
 from synth.scene.template import SCENES
-from synth.simulate import indenter, simulate, stepping
+from synth.simulate import indenter, simulate
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
-from synth.simulate.newton import AIM, LEAST_VISCOSITY, MAX_ERROR, MOST_VISCOSITY, Solution, next_viscosity, solve
 from synth.simulate.options import STANDARD, SolverOptions
+from synth.simulate.policy import load_steps, multipliers
+from synth.simulate.policy.newton import (
+    AIM,
+    LEAST_VISCOSITY,
+    MAX_ERROR,
+    MOST_VISCOSITY,
+    Solution,
+    next_viscosity,
+    solve,
+)
+from synth.simulate.policy.requests import Asking
 from synth.simulate.press import Press
 from synth.simulate.scene_path import path_of
 from synth.simulate.solve import simulate_press
@@ -49,7 +59,7 @@ def cube(**fields: Any) -> dict[str, Any]:
 @pytest.mark.parametrize("turned", [(0.0, 0.0, 0.0), (20.0, 10.0, 30.0)])
 def test_a_cube_is_the_block_of_its_fillet(folder: Path, monkeypatch, turned: tuple[float, float, float]) -> None:
     monkeypatch.setattr(indenter, "OBJECT_STIFFNESS", 1.0)  # as that of the block
-    monkeypatch.setattr(stepping, "DEEP", np.inf)  # so that the cube has the passes of the block
+    monkeypatch.setattr(multipliers, "DEEP", np.inf)  # so that the cube has the passes of the block
     fillet = 0.7  # more than what the mesh asks for, so that both keep it
     block = {"shape": "box", "size_mm": [EDGE, EDGE, EDGE], "fillet_mm": fillet, "rotation_deg": turned}
     exact = simulate(pressed(block), MESH, options=STRICT)
@@ -80,7 +90,7 @@ def test_a_body_is_no_deeper_in_the_gel_than_allowed(folder: Path, monkeypatch: 
         batched = simulate_presses([press], prepare(press.scene, mesh, "cpu"), frames=frames and [frames])
         return [simulate_press(press, frames), *dict(batched).values()]
 
-    found, allowed = both(soft(4.0, cube())), stepping.DEEP * DEPTH
+    found, allowed = both(soft(4.0, cube())), multipliers.DEEP * DEPTH
     for trajectory, last in zip(found, both(soft(4.0, cube()), frozenset({2})), strict=True):
         assert trajectory.status == "complete"
         assert 0 < max(state.max_penetration_mm for state in trajectory.states) <= allowed
@@ -91,7 +101,7 @@ def test_a_body_is_no_deeper_in_the_gel_than_allowed(folder: Path, monkeypatch: 
     for body, share in ((cube(), "2%"), ({"shape": "sphere", "radius_mm": 3.0}, "20%")):
         for trajectory in both(soft(0.05, body)):
             assert f"the gel stays inside the indenter by more than {share} of the depth" in trajectory.reason
-    monkeypatch.setattr(stepping, "MAX_STIFFENING", 1.0)
+    monkeypatch.setattr(multipliers, "MAX_STIFFENING", 1.0)
     assert "the gel stays inside" in simulate_press(soft(4.0, cube())).reason
 
 
@@ -106,13 +116,15 @@ def test_relaxation_finds_the_equilibrium_of_newtons_method(folder: Path, monkey
     ):
         expected = simulate(drawn, MESH, folder)
 
-        def unlucky(*given: Any, fails: Callable[..., bool] = fails) -> Solution:
-            found = solve(*given)
-            return replace(found, converged=False) if fails(*given[3:]) else found
+        def unlucky(*given: Any, fails: Callable[..., bool] = fails) -> Asking[Solution]:
+            found = yield from solve(*given)
+            return replace(found, converged=False) if fails(*given[1:]) else found
 
         with monkeypatch.context() as patched:
-            patched.setattr(stepping, "MAX_RELAXED_STEP", 2.0)  # more than a whole update
-            patched.setattr(stepping, "solve", unlucky)
+            patched.setattr(load_steps, "MAX_RELAXED_STEP", 2.0)
+            patched.setattr(multipliers, "MAX_RELAXED_UPDATE", 2.0)
+            for part in (load_steps, multipliers):
+                patched.setattr(part, "solve", unlucky)
             relaxed = complete(drawn, MESH, folder)
         for one, other in zip(expected.states[1:], relaxed.states[1:], strict=True):
             assert one.newton_iterations != other.newton_iterations
@@ -127,7 +139,8 @@ def test_relaxation_goes_on_where_newtons_method_ends_and_viscosity_follows_the_
     drawn = scene(SIZE, indenter=key, friction=0.3, motion=moves, numerics={"element": "auto"})
     states = complete(drawn, MESH, SCENES / "objects").states
     assert all(state.residual < 1e-5 and state.min_jacobian > 0 for state in states)
-    monkeypatch.setattr(stepping, "MAX_RELAXED_STEP", 0.0)
+    monkeypatch.setattr(load_steps, "MAX_RELAXED_STEP", 0.0)
+    monkeypatch.setattr(multipliers, "MAX_RELAXED_UPDATE", 0.0)
     assert simulate(drawn, MESH, SCENES / "objects").status == "partial"
     errors = (AIM, AIM / 2, 0.0, 2 * MAX_ERROR, np.inf)
     same, less, least, more, most = (next_viscosity(1.0, error) for error in errors)

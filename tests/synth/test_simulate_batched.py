@@ -136,14 +136,14 @@ def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, sti
     body = System(space, material)
     bodies = indenters(scene(friction=0.3, motion={"depth_mm": 0.5, "shear_mm": [0.1, 0.0]}), 0.45)
     zero = body.zero()
-    body.residual(zero, bodies)
-    body.update_contact_history(zero, bodies, new_only=1)
+    at_rest = body.residual(zero, bodies)
+    body.update_contact_history(zero, at_rest, bodies, new_only=1)
     u = np.where(space.held, 0.0, 0.05 * rng.standard_normal(zero.u.shape))
     state = Unknowns(u, rng.uniform(-4.0, 0.0, zero.p.shape))
     tangent = dense(body, body.tangent(state, bodies, 0.7))
 
     given, zeros, launch = (partial(call, device="cpu") for call in (warp_array, wp.zeros, wp.launch))
-    rows, elements, points = padded(len(body.free)), (len(mesh.tets), 1), body.gap.shape
+    rows, elements, points = padded(len(body.free)), (len(mesh.tets), 1), at_rest.gap.shape
     tables, faces = bulk_tables(space, material, body.mixed, "cpu"), face_tables(space, "cpu")
     numbering = number_rows(space, body.free, rows, tables, "cpu")
     x = np.zeros((rows, 1), dtype=np.float32)

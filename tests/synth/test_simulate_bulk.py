@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from closed_forms import lame_modulus, piola
 from integrals import Integrals
-from pads import ELEMENT, MIXED, crooked, dense, far_away
+from pads import ELEMENT, MIXED, crooked, dense, far_away, found_by_newton
 
 from synth.arrays import FloatArray
 from synth.simulate.material import Material, uniform
-from synth.simulate.newton import solve
 from synth.simulate.pattern import pattern_of
 from synth.simulate.space import Space, function_space
 from synth.simulate.system import System, Unknowns
@@ -197,7 +196,7 @@ def test_inverted_element_is_noticed(case: Case) -> None:
     state = body.zero()
     state.u[int(np.flatnonzero(~body.space.held[:, 0])[0])] = MESH.size_mm
     assert body.residual(state, far_away()).smallest_jacobian < 0
-    outcome = solve(body, state, far_away(), 1e-6)
+    outcome = found_by_newton(body, state, far_away(), 1e-6)
     assert not outcome.converged
 
 

@@ -9,11 +9,13 @@ from bonded_layer import disc, growing, walls_and_window
 from pads import DRAG, FILM, MIXED, PUNCH, SIZE, SPHERE, brick, complete, gentle, pad, run, scene, supported
 from touching import Touch
 
+from synth.simulate.direct import DirectPress
 from synth.simulate.element import p2p1
 from synth.simulate.indenter import rigid_body
 from synth.simulate.load_path import LoadPath
 from synth.simulate.material import uniform
-from synth.simulate.stepping import Stepper
+from synth.simulate.options import STANDARD
+from synth.simulate.policy.load_steps import LoadSteps
 from synth.simulate.system import System
 
 MESH, FINE = brick(), brick(counts=(8, 6, 3))
@@ -22,10 +24,10 @@ each = pytest.mark.parametrize("element", MIXED)
 FRICTION, RADIUS, CONTACT, FAR = 0.5, 20.0, 1.0, 12.0
 
 
-def touch(stepper: Stepper) -> SimpleNamespace:
+def touch(press: DirectPress) -> SimpleNamespace:
     """The contact points (f, q) that touch at the end of a path: positions in mm, tractions (k, 3) and their sizes."""
-    stepper._place(stepper.at)
-    made = Touch(stepper.system, stepper.state, stepper.indenter, 0.0)
+    press.place(press.path.length_mm)
+    made = Touch(press.system, press.state, press.indenter, 0.0)
     made.evaluate()
     on = made.tractions[0].any(axis=-1)
     normal, along = (traction[on] for traction in made.tractions)
@@ -38,9 +40,9 @@ def touch(stepper: Stepper) -> SimpleNamespace:
 def test_without_friction_nothing_pulls_sideways(element: str) -> None:
     """No tangential traction anywhere, so the ball's force goes through its centre, and its twist does nothing."""
     numerics = {"element": element}
-    stepper = run(gentle(friction=0.0, motion={**DRAG, "shear_mm": [0.0, 0.0]}, numerics=numerics), MESH)
-    assert not stepper.system.tangential.numpy().any()
-    states = stepper.states
+    press = run(gentle(friction=0.0, motion={**DRAG, "shear_mm": [0.0, 0.0]}, numerics=numerics), MESH)
+    assert not touch(press).along.any()
+    states = press.states
     pressed, twisted = states[2], states[-1]
     assert (pressed.depth_mm, pressed.twist_deg) == (0.6, 0.0)
     centre = np.array([0.4, 0.2, 0.6 - 3.0])
@@ -59,8 +61,8 @@ def test_long_shear_slides_at_the_friction_coefficient(element, mesh, indenter, 
     mu = 0.3
     motion = {"depth_mm": 0.5, "shear_mm": [3.0, 0.0], "position_mm": [-1.5, 0.0], "steps": 4}
     numerics = {"max_step_mm": step, "element": element}
-    stepper = run(scene(indenter=indenter, friction=mu, motion=motion, numerics=numerics), mesh)
-    made = touch(stepper)
+    press = run(scene(indenter=indenter, friction=mu, motion=motion, numerics=numerics), mesh)
+    made = touch(press)
     assert (made.friction <= mu * made.pressure * (1 + 1e-9)).all()
     # A point that came in at the leading edge may still stick: at most the area passed in the last step has.
     assert made.area @ made.friction == pytest.approx(mu * made.area @ made.pressure, rel=0.01)
@@ -68,7 +70,7 @@ def test_long_shear_slides_at_the_friction_coefficient(element, mesh, indenter, 
     # Tractions are along the surface, which leans by up to a fifth: its cosine, and the pressure's vertical part.
     assert pull[0] / load[2] == pytest.approx(mu, rel=0.04)
     assert abs(pull[1]) < 0.01 * pull[0]
-    last = stepper.states[-1]
+    last = press.states[-1]
     assert last.slip_ratio > 0.98
     # The recorded force has the pressure's sideways part, too.
     assert last.force_n[0] / last.force_n[2] == pytest.approx(mu + load[0] / load[2], rel=0.05)
@@ -83,12 +85,12 @@ def test_traction_stays_in_its_cone(element: str, friction: float, layers: bool)
     motion["then"] = [{"depth_mm": 0.6, "shear_mm": [0.2, 0.0], "twist_deg": 5.0}]
     gel = {"poisson_ratio": 0.5, "layers": [FILM] if layers else []}
     numerics = {"element": element, "max_step_mm": 0.25, "edge_length_mm": None}
-    stepper = run(scene(SIZE, gel=gel, friction=friction, motion=motion, numerics=numerics), pad(layers))
-    made = touch(stepper)
+    press = run(scene(SIZE, gel=gel, friction=friction, motion=motion, numerics=numerics), pad(layers))
+    made = touch(press)
     # The return map scales to the limit: a few roundings.
     assert (made.friction <= friction * made.pressure * (1 + 1e-12)).all()
     np.testing.assert_allclose((made.normal * made.along).sum(axis=1), 0.0, atol=1e-12 * made.pressure.max() ** 2)
-    assert ((made.position - stepper.indenter.centre.numpy()[0]) * made.normal > 0).any(axis=1).all()
+    assert ((made.position - press.indenter.centre.numpy()[0]) * made.normal > 0).any(axis=1).all()
     slip = made.friction > friction * made.pressure * (1 - 1e-6)
     assert slip.any()
     assert friction < 2 or not slip.all()
@@ -112,15 +114,15 @@ def test_spinning_punch_is_held_by_its_limit(element: str) -> None:
 def test_rough_contact_sticks(element: str) -> None:
     """Friction of 10: next to nothing slips, and the touching points go where the indenter goes."""
     motion = {"depth_mm": 0.6, "shear_mm": [0.15, 0.0], "steps": 4}
-    stepper = run(scene(friction=10.0, motion=motion, numerics={"element": element}), MESH)
-    states, space = stepper.states, stepper.system.space
+    press = run(scene(friction=10.0, motion=motion, numerics={"element": element}), MESH)
+    states, space = press.states, press.system.space
     for state in states:
         # By Cattaneo and Mindlin a rim of this share of the contact slips under T; one of 22 points may be in it.
         share = np.hypot(*state.force_n[:2]) / (10 * state.force_n[2]) if state.force_n[2] > 0 else 0.0
         assert state.slip_ratio <= 1 - (1 - share) ** (2 / 3) + 1 / 22 + 1e-9
     pressed = next(state for state in states if state.depth_mm == 0.6)
     at_nodes = (states[-1].displacement - pressed.displacement)[space.faces]
-    moved = np.einsum("qa,fac->fqc", space.element.face_shape, at_nodes)[touch(stepper).on]
+    moved = np.einsum("qa,fac->fqc", space.element.face_shape, at_nodes)[touch(press).on]
     assert len(moved) > 0
     done = states[-1].shear_mm[0] - pressed.shear_mm[0]
     assert done > 0.1
@@ -181,8 +183,9 @@ def test_the_stick_zone_is_cattaneos_and_mindlins_and_all_slides_where_the_pull_
     ball, motion = {"shape": "sphere", "radius_mm": RADIUS}, {"depth_mm": depth, "steps": 1 + len(legs), "then": legs}
     posed = scene((30.0, 30.0, FAR), indenter=ball, friction=FRICTION, motion=motion, numerics={"max_step_mm": depth})
     body = System(supported(mesh, p2p1(), partial(walls_and_window, half=True)), uniform(len(mesh.tets), 0.5))
-    ended = Stepper(body, LoadPath(posed.motion, rigid_body(posed.contact.indenter)), FRICTION, posed.numerics, 1.0)
-    states = [state for state in ended.run().states if state.shear_mm[0] > 0]
+    path = LoadPath(posed.motion, rigid_body(posed.contact.indenter))
+    ended = DirectPress(body, path, FRICTION, 1.0, LoadSteps(path, mesh.size_mm, True, posed.numerics, STANDARD)).run()
+    states = [state for state in ended.states if state.shear_mm[0] > 0]
     pulls = np.array([state.force_n[0] / (FRICTION * state.force_n[2]) for state in states])
     np.testing.assert_allclose(pulls[:3], [0.2, 0.5, 0.8], atol=0.02)
     # Where it begins to slide as a whole: within one load step of where the pull reaches friction's limit.
@@ -211,7 +214,8 @@ def test_partial_slip_is_mindlins() -> None:
     space = supported(mesh, p2p1(), partial(walls_and_window, half=True))
     body = System(space, uniform(len(mesh.tets), 0.5))
     path = LoadPath(posed.motion, rigid_body(posed.contact.indenter))
-    ended = Stepper(body, path, FRICTION, posed.numerics, 1.0).run()
+    steps = LoadSteps(path, mesh.size_mm, FRICTION > 0, posed.numerics, STANDARD)
+    ended = DirectPress(body, path, FRICTION, 1.0, steps).run()
     assert (ended.status, ended.reason) == ("complete", "")
     slid = [state for state in ended.states if state.shear_mm[0] > 0]
     assert len(slid) == 3

@@ -10,11 +10,11 @@ from pads import DRAG, FILM, MIXED, PUNCH, SIZE, SPHERE, brick, complete, gentle
 
 import synth.simulate.linear as linear
 import synth.simulate.pattern as pattern
-import synth.simulate.stepping as stepping
 from synth.arrays import FloatArray
 from synth.mesh import PadMesh
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate
+from synth.simulate.policy import load_steps, multipliers
 from synth.simulate.solve import check_shared
 
 MESH = brick()
@@ -114,7 +114,7 @@ def test_what_touches_nothing_leaves_the_pad_and_above_it_needs_no_solve(monkeyp
     ring = {"shape": "torus", "radius_mm": 9.0, "tube_mm": 0.5}  # around the pad
     for depth, body in ((0.6, ring), (-0.5, SPHERE), (0.0, SPHERE)):
         if depth <= 0:
-            monkeypatch.setattr(stepping, "solve", never)
+            monkeypatch.setattr(load_steps, "solve", never)
         result = simulate(gentle(indenter=body, motion={**DRAG, "depth_mm": depth}), MESH)
         assert (result.status, len(result.states)) == ("complete", 5)
         fields = [field for state in result.states for field in (state.displacement, state.traction, state.force_n)]
@@ -189,7 +189,7 @@ def test_correction_passes_take_penetration_away(monkeypatch: pytest.MonkeyPatch
         return last.force_n[2], last.max_penetration_mm
 
     (soft, deep), (hard, _) = press(10.0), press(200.0)
-    monkeypatch.setattr(stepping, "PENETRATION", np.inf)
+    monkeypatch.setattr(multipliers, "PENETRATION", np.inf)
     (soft_alone, deep_alone), (hard_alone, _) = press(10.0), press(200.0)
     assert deep < 0.5 * deep_alone
     assert abs(hard - soft) < 0.5 * abs(hard_alone - soft_alone)

@@ -6,28 +6,43 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pads import SIZE, SPHERE, brick, complete, gentle, indenters, presses_of, same, scene, simulate_scenes, system
+from pads import (
+    SIZE,
+    SPHERE,
+    Found,
+    brick,
+    complete,
+    found_by_newton,
+    gentle,
+    indenters,
+    presses_of,
+    same,
+    scene,
+    simulate_scenes,
+    system,
+)
 
-import synth.simulate.stepping as stepping
 from synth.scene import Scene
-from synth.simulate import Trajectory, newton, simulate
+from synth.simulate import Trajectory, simulate
 from synth.simulate.batched import lanes as phases
 from synth.simulate.batched import run as running
 from synth.simulate.batched.pad import prepare
 from synth.simulate.batched.run import Run
-from synth.simulate.newton import NEAR, Solution, relative_residual, solve
+from synth.simulate.direct import DirectPress
 from synth.simulate.options import STANDARD, SolverOptions
+from synth.simulate.policy import load_steps, multipliers, newton
+from synth.simulate.policy.newton import NEAR, Solution, solve
+from synth.simulate.policy.requests import Asking, Evaluation
 from synth.simulate.press import Press
-from synth.simulate.solve import stepper_of
-from synth.simulate.stepping import Stepper
+from synth.simulate.solve import direct_press
 from synth.simulate.system import System
 
 MESH = brick(counts=(4, 4, 2))
 TOLERANCE = 1e-8
 RELAXED = SolverOptions(relaxed_tolerance=1e-2)
-BETWEEN = stepping.MULTIPLIER_TOLERANCE * TOLERANCE
+BETWEEN = multipliers.MULTIPLIER_TOLERANCE * TOLERANCE
 POLISHES = {"before the passes": (2e-3, BETWEEN), "after a pass": (0.06, TOLERANCE), "for no pass": (np.inf, TOLERANCE)}
-"""stepping.PENETRATION, and a polish's tolerance: the ball is 0.08 of its depth inside, after a pass less than 0.06."""
+"""PENETRATION and a polish's tolerance: the ball is 0.08 of its depth inside, after a pass less than 0.06."""
 each = pytest.mark.parametrize("polish", list(POLISHES))
 PRESSED = 0.3  # mm of depth, in one go
 PAD = brick(SIZE, (4, 4, 2))
@@ -56,51 +71,51 @@ def test_wanted_states_meet_the_full_tolerance_and_others_the_relaxed_one() -> N
 
 
 class Losing:
-    """Newton's method for the stepper, which ends `most` polishes after three to six iterations."""
+    """Newton's method for passes and polishes, which ends `most` polishes after three to six iterations."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, most: int, polish: str = "before the passes") -> None:
         self.lost, self._most = 0, most
         penetration, self._tolerance = POLISHES[polish]
-        monkeypatch.setattr(stepping, "PENETRATION", penetration)
-        monkeypatch.setattr(stepping, "solve", self)
+        monkeypatch.setattr(multipliers, "PENETRATION", penetration)
+        monkeypatch.setattr(multipliers, "solve", self)
 
-    def __call__(self, system: Any, start: Any, indenter: Any, tolerance: float, *limit: Any) -> Solution:
-        polishes = limit[:1] == (stepping.MAX_ITERATIONS,) and tolerance == self._tolerance
-        if not polishes or self.lost == self._most:
-            return solve(system, start, indenter, tolerance, *limit)
+    def __call__(self, at: Evaluation, tolerance: float, *limits: Any) -> Asking[Solution]:
+        if limits or tolerance != self._tolerance or self.lost == self._most:
+            return (yield from solve(at, tolerance, *limits))
         self.lost += 1
-        return solve(system, start, indenter, 0.0, 3)
+        return (yield from solve(at, 0.0, 3))
 
 
-def memory(stepper: Stepper) -> list[np.ndarray]:
+def memory(press: DirectPress) -> list[np.ndarray]:
     """What the next step goes on from: the state, contact, and the place on the path."""
-    places = np.array([stepper.at, stepper.next, len(stepper.states)])
-    return [stepper.state.u.copy(), stepper.state.p.copy(), *stepper.system.saved_contact().values(), places]
+    places = np.array([press.steps.at, press.steps.next, len(press.states)])
+    return [press.state.u.copy(), press.state.p.copy(), *press.system.saved_contact().values(), places]
 
 
-def followed(stepper: Stepper, losing: Losing, monkeypatch: pytest.MonkeyPatch) -> tuple[Trajectory, int]:
+def followed(press: DirectPress, losing: Losing, monkeypatch: pytest.MonkeyPatch) -> tuple[Trajectory, int]:
     """Where a press ends, and in how many steps; a step that loses its record must leave no trace."""
-    advance, steps = stepper._advance, [0]
+    policy, count = press.steps, [0]
+    advance = policy._advance
 
-    def step() -> None:
-        before, lost, length = memory(stepper), losing.lost, stepper.target() - stepper.at
-        allowed = stepper.step  # of the next step, unless this one, half as long again, is longer
-        advance()
-        steps[0] += 1
+    def step() -> Asking[None]:
+        before, lost, length = memory(press), losing.lost, policy.target() - policy.at
+        allowed = policy.step  # of the next step, unless this one, half as long again, is longer
+        yield from advance()
+        count[0] += 1
         if losing.lost > lost:
-            assert all((a == b).all() for a, b in zip(memory(stepper), before, strict=True))
-            assert stepper.step == length / 2
+            assert all((a == b).all() for a, b in zip(memory(press), before, strict=True))
+            assert policy.step == length / 2
         else:
-            assert stepper.step <= max(allowed, stepping.GROWTH * length)
+            assert policy.step <= max(allowed, load_steps.GROWTH * length)
 
-    monkeypatch.setattr(stepper, "_advance", step)
-    return stepper.run(), steps[0]
+    monkeypatch.setattr(policy, "_advance", step)
+    return press.run(), count[0]
 
 
 @each
 def test_a_lost_record_leaves_no_trace_and_is_tried_again(monkeypatch: pytest.MonkeyPatch, polish: str) -> None:
     losing = Losing(monkeypatch, most=1, polish=polish)
-    result, _ = followed(stepper_of(Press.of(pressed(), MESH), options=RELAXED), losing, monkeypatch)
+    result, _ = followed(direct_press(Press.of(pressed(), MESH), options=RELAXED), losing, monkeypatch)
     assert losing.lost == 1
     assert len(result.states) == 3
     assert max(residuals(result)) <= TOLERANCE
@@ -111,19 +126,19 @@ def test_a_record_that_is_always_lost_ends_the_path(monkeypatch: pytest.MonkeyPa
     """Each loss halves what is left of the path, so that SHORTEST_STEP is soon reached."""
     losing = Losing(monkeypatch, most=1000, polish=polish)
     posed = pressed(steps=1)
-    result, steps = followed(stepper_of(Press.of(posed, MESH), options=RELAXED), losing, monkeypatch)
+    result, steps = followed(direct_press(Press.of(posed, MESH), options=RELAXED), losing, monkeypatch)
     assert (result.status, "did not converge" in result.reason, len(result.states)) == ("failed", True, 1)
     # The last step is shorter than max_step_mm / 64; each loss is followed by one good step of half its length.
-    halvings = 1 + np.log2(1 / stepping.SHORTEST_STEP)
+    halvings = 1 + np.log2(1 / load_steps.SHORTEST_STEP)
     assert losing.lost <= halvings
     assert steps <= 0.8 / posed.numerics.max_step_mm + 2 * halvings
 
 
 def test_a_step_that_fails_late_ends_the_press(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stepping, "MAX_PRESS_ITERATIONS", 10)
-    _, steps = followed(stepper_of(Press.of(pressed(), MESH)), Losing(monkeypatch, most=0), monkeypatch)
+    monkeypatch.setattr(load_steps, "MAX_PRESS_ITERATIONS", 10)
+    _, steps = followed(direct_press(Press.of(pressed(), MESH)), Losing(monkeypatch, most=0), monkeypatch)
     losing = Losing(monkeypatch, most=1)
-    result, lost_steps = followed(stepper_of(Press.of(pressed(), MESH)), losing, monkeypatch)
+    result, lost_steps = followed(direct_press(Press.of(pressed(), MESH)), losing, monkeypatch)
     assert (result.status, "did not converge" in result.reason, losing.lost) == ("failed", True, 1)
     assert lost_steps < steps
 
@@ -158,20 +173,20 @@ def body() -> System:
     return system(PAD, 0.49)
 
 
-def press(body: System, tolerance: float = EXACT, **limits: float) -> Solution:
+def press(body: System, tolerance: float = EXACT, **limits: Any) -> Found:
     body.forget_factor()
-    return solve(body, body.zero(), indenters(scene(), PRESSED), tolerance, **limits)
+    return found_by_newton(body, body.zero(), indenters(scene(), PRESSED), tolerance, **limits)
 
 
 def test_a_press_converges_and_a_start_in_equilibrium_costs_one_iteration(body: System) -> None:
     found = press(body)
     assert found.converged
     assert 2 <= found.iterations <= 12
-    assert relative_residual(body.residual(found.state, indenters(scene(), PRESSED))) <= EXACT
+    assert found.relative <= EXACT
     # A start that happens to be within the tolerance is improved once; no force costs nothing.
-    assert solve(body, found.state, indenters(scene(), PRESSED), EXACT).iterations == 1
+    assert found_by_newton(body, found.state, indenters(scene(), PRESSED), EXACT).iterations == 1
     away = indenters(scene(motion={"depth_mm": -1.0}), 0.0)
-    assert solve(body, body.zero(), away, EXACT).iterations == 0
+    assert found_by_newton(body, body.zero(), away, EXACT).iterations == 0
 
 
 def test_the_limit_is_kept_far_from_equilibrium_doubled_near_it_and_too_far_is_none(body, monkeypatch) -> None:
@@ -181,7 +196,7 @@ def test_the_limit_is_kept_far_from_equilibrium_doubled_near_it_and_too_far_is_n
         found = press(body, limit=limit)
         assert found.iterations == limit
         assert found.converged == (limit == needed)
-        assert (relative_residual(found.residual) > NEAR) == (limit == 1)
+        assert (found.relative > NEAR) == (limit == 1)
     found = press(body, limit=needed - 1)
     assert (found.iterations, found.converged) == (needed, True)
     never = press(body, 1e-30, limit=needed)
@@ -199,9 +214,9 @@ def test_the_limit_is_kept_far_from_equilibrium_doubled_near_it_and_too_far_is_n
 
 def test_double_factor_solves_to_double_precision() -> None:
     options = SolverOptions(single_precision=False, reuse_factors=False)
-    stepper = stepper_of(Press.of(scene(numerics={"element": "p2p1"}), PAD), options=options)
-    body = stepper.system
-    tangent = body.tangent(body.zero(), stepper.indenter)
+    made = direct_press(Press.of(scene(numerics={"element": "p2p1"}), PAD), options=options)
+    body = made.system
+    tangent = body.tangent(body.zero(), made.indenter)
     right = np.random.default_rng(0).standard_normal(len(body.free))
     step = body.newton_step(tangent, right)
     solution = np.concatenate([step.u.ravel(), step.p])[body.free]
@@ -297,7 +312,7 @@ def test_a_pass_that_goes_too_far_is_given_up() -> None:
             assert lanes.trial_moved.numpy()[0] == pytest.approx(moved, abs=1e-15)
         if phase in (phases.READY, phases.SOLVED):
             assert moved <= reach
-            assert reach == pytest.approx(stepping.MAX_CORRECTION_RATIO * lanes.deepest.numpy()[0], rel=1e-12)
+            assert reach == pytest.approx(multipliers.MAX_CORRECTION_RATIO * lanes.deepest.numpy()[0], rel=1e-12)
             depths.setdefault(lanes.target.numpy()[0], lanes.deepest.numpy()[0])
         if phase == phases.SOLVED:
             solved += 1
@@ -315,16 +330,15 @@ def test_a_pass_that_goes_too_far_is_given_up() -> None:
 
 
 def test_so_does_the_solver_for_one_sample(monkeypatch: pytest.MonkeyPatch) -> None:
-    solve, given = stepping.solve, []
+    given = []
 
-    def watched(system: Any, start: Any, *others: Any) -> Any:
-        found = solve(system, start, *others)
-        if len(others) == 4:  # with a limit of iterations and a reach
-            moved = np.linalg.norm(found.state.u - start.u, axis=1).max()
-            given.append((found.converged, found.iterations, float(moved / others[3])))
+    def watched(at: Evaluation, tolerance: float, *limits: Any) -> Asking[Solution]:
+        found = yield from solve(at, tolerance, *limits)
+        if limits:  # of iterations, and a reach
+            given.append((found.converged, found.iterations, found.at.moved_mm / limits[1]))
         return found
 
-    monkeypatch.setattr(stepping, "solve", watched)
+    monkeypatch.setattr(multipliers, "solve", watched)
     rod = {"shape": "cylinder", "radius_mm": 1.5, "length_mm": 4.0, "fillet_mm": 0.3}
     result = simulate(sliding(rod), brick(counts=(5, 5, 2)), options=STRICT_WAY)
     assert result.status == "complete"

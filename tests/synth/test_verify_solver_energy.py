@@ -18,11 +18,13 @@ from synth.arrays import FloatArray
 from synth.mesh import PadMesh
 from synth.scene import Scene
 from synth.simulate.contact import Indenters
+from synth.simulate.direct import DirectPress
 from synth.simulate.material import pad_material
+from synth.simulate.options import STANDARD
+from synth.simulate.policy.load_steps import LoadSteps
 from synth.simulate.press import Press
 from synth.simulate.space import Space, function_space
-from synth.simulate.stepping import Stepper
-from synth.simulate.system import System, Unknowns
+from synth.simulate.system import Residual, System, Unknowns
 
 PRESS = {"depth_mm": 0.8}
 DRAG = {"depth_mm": 0.8, "shear_mm": [1.2, 0.3]}
@@ -50,17 +52,17 @@ class Ledger(System):
 
     account: Account
 
-    def update_contact_history(self, state: Unknowns, indenter: Indenters, new_only: int = 0) -> None:
+    def update_contact_history(self, state: Unknowns, at: Residual, indenter: Indenters, new_only: int = 0) -> None:
         if new_only:
-            return super().update_contact_history(state, indenter, new_only)
+            return super().update_contact_history(state, at, indenter, new_only)
         centre, rotation = indenter.centre.numpy()[0].copy(), indenter.rotation.numpy()[0].copy()
-        force, moment = self.forces(state)[:2]
-        along, whole = self.tangential.numpy()[0], self.traction.numpy()[0]
+        force, moment = self.forces(state, at)[:2]
+        along, whole = at.tangential.numpy()[0], at.traction.numpy()[0]
         about = {"force": force, "moment": moment - np.cross(centre, force), "rubbing": along @ rotation}
         now = SimpleNamespace(centre=centre, rotation=rotation, **about)
         weight = self._faces.weight.numpy()
         anchor, anchored = self.contact.anchor.numpy()[0].copy(), self.contact.anchored.numpy()[0] == 1
-        super().update_contact_history(state, indenter)
+        super().update_contact_history(state, at, indenter)
         moved = self.contact.anchor.numpy()[0] - anchor
         moved[~(anchored & (self.contact.anchored.numpy()[0] == 1))] = 0.0
         account, before = self.account, self.account.last
@@ -99,10 +101,12 @@ def account(element: str, steps: int, motion: dict, friction=0.0, layers=False, 
     numerics, material = posed.numerics, pad_material(posed.sensor.gel, mesh)
     ledger = Ledger(function_space(mesh, ELEMENT[element]()), material, penalty=numerics.penalty)
     ledger.account = Account()
-    stepper = Stepper(ledger, Press.of(posed, mesh).path, friction, numerics, E_MPA)
-    ended = stepper.run()
+    path = Press.of(posed, mesh).path
+    steps = LoadSteps(path, SIZE, friction > 0, numerics, STANDARD)
+    press = DirectPress(ledger, path, friction, E_MPA, steps)
+    ended = press.run()
     assert (ended.status, ended.reason) == ("complete", "")
-    ledger.account.stored = own_integrals(ledger.space).energy(material, stepper.state.u, stepper.state.p)
+    ledger.account.stored = own_integrals(ledger.space).energy(material, press.state.u, press.state.p)
     return ledger.account
 
 
@@ -191,13 +195,15 @@ def test_recorded_displacement_and_force_belong_together(element: str, friction:
 def test_window_bears_what_the_indenter_does(element, nu, motion, friction, layers) -> None:
     """With a pressure field, a stiff film, and from the side."""
     posed, mesh = case(element, nu, friction, motion, layers), pad(layers)
-    stepper = run(posed, mesh)
-    body, state = stepper.system, stepper.state
-    stepper._place(stepper.at)
-    body.residual(state, stepper.indenter)
-    force, moment = body.forces(state)[:2]
+    press = run(posed, mesh)
+    body, state = press.system, press.state
+    press.place(press.path.length_mm)
+    residual = body.residual(state, press.indenter)
+    force, moment = body.forces(state, residual)[:2]
     rule, material = own_integrals(body.space), pad_material(posed.sensor.gel, mesh)
     check(body.space, state.u, rule.forces(rule.stress(material, state.u, state.p)), force, moment)
     if motion is BESIDE:
-        sideways = body.traction.numpy()[0][(body.space.points[body.space.faces][:, :, 0] == SIZE[0] / 2).all(axis=1)]
+        sideways = residual.traction.numpy()[0][
+            (body.space.points[body.space.faces][:, :, 0] == SIZE[0] / 2).all(axis=1)
+        ]
         assert sideways.any()

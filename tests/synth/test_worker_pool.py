@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -28,6 +29,25 @@ def test_a_worker_changes_no_bit(tmp_path: Path) -> None:
     out = tmp_path / "d"
     generate(load_scene(write_tiny(tmp_path)), 5, out, scheduling=Scheduling(workers=1))
     assert fingerprint(out) == fingerprint(reference())
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(("cores", "trajectories", "workers"), [(2, 3, 2), (3, 3, 3), (4, 3, None), (1, 3, None)])
+def test_a_long_job_has_a_worker_for_each_core(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int, trajectories: int, workers: int | None
+) -> None:
+    """Where each has something to do, and the memory for it."""
+    module = sys.modules[generate.__module__]
+    monkeypatch.setattr(module, "WORTH_A_WORKER", 1)
+    monkeypatch.setattr(module, "cores", lambda: cores)
+    template = load_scene(write_tiny(tmp_path))
+    context = job_context(template, 5, tmp_path / "d")
+    assert module._workers_here(context, trajectories) == workers
+    if workers:
+        generate(template, 5, tmp_path / "d")
+        assert fingerprint(tmp_path / "d") == fingerprint(reference())
+    monkeypatch.setattr(module, "predict", lambda plan: SimpleNamespace(memory_bytes=2**60))
+    assert module._workers_here(context, trajectories) is None
 
 
 UNGUARDED = """

@@ -1,6 +1,6 @@
 """A gel touched by an indenter with a random state of contact: every branch of the contact law in one evaluation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from pads import ELEMENT, crooked, indenters, scene, system
 
 from synth.arrays import BoolArray, FloatArray
 from synth.simulate.contact import Indenters
-from synth.simulate.system import System, Unknowns
+from synth.simulate.system import Residual, System, Unknowns
 
 MESH = crooked()
 PENALTY = 7.0
@@ -39,9 +39,14 @@ class Touch:
     state: Unknowns
     indenters: Indenters
     friction: float
+    residual: Residual = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.evaluate()
 
     def evaluate(self, state: Unknowns | None = None) -> FloatArray:
-        return self.body.residual(state or self.state, self.indenters).free
+        self.residual = self.body.residual(state or self.state, self.indenters)
+        return self.residual.free
 
     @property
     def points(self) -> FloatArray:
@@ -69,9 +74,9 @@ class Touch:
 
     @property
     def tractions(self) -> tuple[FloatArray, FloatArray]:
-        """(f, q, 3) normal and tangential, of the last evaluation (copies: Warp's arrays are views)."""
-        along = self.body.tangential.numpy()[0].copy()
-        return self.body.traction.numpy()[0] - along, along
+        """(f, q, 3) normal and tangential, of the last evaluation."""
+        along = self.residual.tangential.numpy()[0]
+        return self.residual.traction.numpy()[0] - along, along
 
     @property
     def mode(self) -> np.ndarray:

@@ -22,9 +22,9 @@ a trajectory. These are the phases, in the order in which a load step passes thr
 
 import warp as wp
 
-from synth.simulate import stepping
 from synth.simulate.contact import Indenters
 from synth.simulate.distance import shape_vector
+from synth.simulate.policy import requests
 
 IDLE, FRESH, FIRST, BEGIN, PREDICTOR, PREDICTOR_READY, PREDICTOR_LINEAR, START, READY, LINEAR = range(10)
 SEARCH, SOLVED, FAILED, AT_RECORD, CORRECTING, RESTORED, RECORD, ADVANCE, ENDED, ROLLED_BACK = range(10, 20)
@@ -46,7 +46,7 @@ class Lanes:
         phase, stage: see the module.
         move: what becomes of its fields in this cycle.
         iteration, limit: of the present Newton solve; step_iterations: of the load step; total: since the last record.
-        next, at, target, step, previous, has_previous: as in `synth.simulate.stepping.Stepper`.
+        next, at, target, step, previous, has_previous: as in `synth.simulate.policy.load_steps.LoadSteps`.
         ratio: of the extrapolation.
         predicted: whether the first iterate is another than the last state.
         tolerance, scale: of Newton's method and its line search.
@@ -54,8 +54,9 @@ class Lanes:
             det F.
         trial_norm, trial_force, trial_jacobian: of the trial; trial_moved: of a pass, farthest that a node has gone
             from the solution before it, mm; most_moved: how far it may.
-        relaxing: 1 while a step or pass is relaxed (`synth.simulate.newton`), 2 after a refused step of it; viscosity:
-            its θ, else 0; part: of the linear step that is tried; trial_error: its error over the residual before.
+        relaxing: 1 while a step or pass is relaxed (`synth.simulate.policy.newton`), 2 after a refused step of it;
+            viscosity: its θ, else 0; part: of the linear step that is tried; trial_error: its error over the residual
+            before.
         trial_held_force: norm of the forces on held nodes; held_force: the least that a relaxation must leave of it.
         passes, failures, done, share: of augmented-Lagrangian passes: their number, those that failed, the shares of
             the others together, and the share of the next; new_share: of the one that begins; sharpness: of the
@@ -177,8 +178,8 @@ def select(lanes: Lanes, phases: int, mask: wp.array(dtype=wp.int32)):
     mask[s] = (phases >> lanes.phase[s]) & 1
 
 
-STICK_FRICTION = wp.constant(wp.float64(stepping.STICK_FRICTION))
-PATH_DERIVATIVE_STEP = wp.constant(wp.float64(stepping.PATH_DERIVATIVE_STEP))
+STICK_FRICTION = wp.constant(wp.float64(requests.STICK_FRICTION))
+PATH_DERIVATIVE_STEP = wp.constant(wp.float64(requests.PATH_DERIVATIVE_STEP))
 
 
 @wp.func

@@ -7,9 +7,9 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.simulate.batched.lanes import COMPLETE, NO_CONTACT, NO_EQUILIBRIUM, TOO_DEEP, Presses
 from synth.simulate.batched.reductions import SCALARS
+from synth.simulate.policy.multipliers import allowed_share
 from synth.simulate.press import Press
 from synth.simulate.space import Space
-from synth.simulate.stepping import allowed_share
 from synth.simulate.tables import struct_of
 from synth.simulate.trajectory import State, Trajectory, at_rest, no_contact, not_converged, too_deep
 

@@ -13,8 +13,8 @@ from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.presses import press_tables, trajectory
 from synth.simulate.batched.solver import INNER_ITERATIONS, BatchedSolver
-from synth.simulate.newton import MAX_ITERATIONS
 from synth.simulate.options import STANDARD, SolverOptions
+from synth.simulate.policy.newton import MAX_ITERATIONS
 from synth.simulate.press import Press
 from synth.simulate.solve import check_shared
 from synth.simulate.trajectory import Trajectory, at_rest

@@ -1,24 +1,23 @@
 """What happens next to a lane, as Warp kernels of one thread a lane.
 
-The rules are those of `synth.simulate.newton` and `stepping`; what differs is that each lane follows them at its own
-pace, that passes are solved to a share of the full tolerance, and that where intermediate steps have a relaxed
-tolerance the full one holds for what is recorded only. A step that ends at a recorded state, and every pass but the
-last, then has the relaxed tolerance, and every pass of a deep object at least MULTIPLIER_TOLERANCE times the full one:
-what they find is changed by the next pass. A state without passes, or whose passes end early, is brought to the full
-tolerance before it is recorded (POLISH); where that fails, the step is halved. The load path goes on from the state
-before, so that it does not depend on which states are corrected. Nothing limits a press's iterations or the turn of
-normals, and no direction is rough.
+The rules are those of `synth.simulate.policy`; what differs is that each lane follows them at its own pace, that passes
+are solved to a share of the full tolerance, and that where intermediate steps have a relaxed tolerance the full one
+holds for what is recorded only. A step that ends at a recorded state, and every pass but the last, then has the relaxed
+tolerance, and every pass of a deep object at least MULTIPLIER_TOLERANCE times the full one: what they find is changed
+by the next pass. A state without passes, or whose passes end early, is brought to the full tolerance before it is
+recorded (POLISH); where that fails, the step is halved. The path does not depend on which states are corrected. Nothing
+limits a press's iterations or the turn of normals, and no direction is rough.
 """
 
 from typing import Any
 
 import warp as wp
 
-from synth.simulate import newton, stepping
 from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.lanes import Lanes, Presses, Settings
 from synth.simulate.contact import Indenters
 from synth.simulate.distance import KINDS
+from synth.simulate.policy import load_steps, multipliers, newton, requests
 
 
 def _doubles(*values: float) -> list[Any]:
@@ -26,16 +25,17 @@ def _doubles(*values: float) -> list[Any]:
 
 
 ZERO, ONE, MIN_TOLERANCE = _doubles(0.0, 1.0, 1.0e-12)  # of a pass: somewhat more than rounding leaves
-FORCE_FLOOR, INDIFFERENT, SHORTEST = _doubles(newton.FORCE_FLOOR, newton.INDIFFERENT, newton.SHORTEST)
+FORCE_FLOOR, INDIFFERENT, SHORTEST = _doubles(requests.FORCE_FLOOR, newton.INDIFFERENT, newton.SHORTEST)
 SUFFICIENT_DECREASE, STALLED_RESIDUAL, NEAR = _doubles(newton.SUFFICIENT_DECREASE, newton.STALLED_RESIDUAL, newton.NEAR)
 MAX_STEPS, STALL_ITERATIONS = wp.constant(newton.MAX_STEPS), wp.constant(newton.STALL_ITERATIONS)
-GROWTH, SHORTEST_STEP, PENETRATION = _doubles(stepping.GROWTH, stepping.SHORTEST_STEP, stepping.PENETRATION)
-MAX_ITERATIONS_TO_GROW = wp.constant(stepping.MAX_ITERATIONS_TO_GROW)
-FAILURES, MAX_FAILURES = wp.constant(stepping.FAILURES), wp.constant(stepping.MAX_FAILURES)
-MULTIPLIER_TOLERANCE, MAX_MULTIPLIER_UPDATES = _doubles(stepping.MULTIPLIER_TOLERANCE, stepping.MAX_MULTIPLIER_UPDATES)
-DEEP, SINKING, SUNK, MAX_STIFFENING = _doubles(stepping.DEEP, stepping.SINKING, stepping.SUNK, stepping.MAX_STIFFENING)
-MAX_CORRECTION_RATIO, MAX_RELAXED_STEP = _doubles(stepping.MAX_CORRECTION_RATIO, stepping.MAX_RELAXED_STEP)
-MESH, MAX_DEEP_PASSES = wp.constant(KINDS["mesh"]), wp.constant(stepping.MAX_DEEP_PASSES)
+GROWTH, SHORTEST_STEP, PENETRATION = _doubles(load_steps.GROWTH, load_steps.SHORTEST_STEP, multipliers.PENETRATION)
+MAX_ITERATIONS_TO_GROW = wp.constant(load_steps.MAX_ITERATIONS_TO_GROW)
+FAILURES, MAX_FAILURES = wp.constant(multipliers.FAILURES), wp.constant(multipliers.MAX_FAILURES)
+DEEP, SINKING, SUNK = _doubles(multipliers.DEEP, multipliers.SINKING, multipliers.SUNK)
+MULTIPLIER_TOLERANCE, MAX_STIFFENING = _doubles(multipliers.MULTIPLIER_TOLERANCE, multipliers.MAX_STIFFENING)
+MAX_MULTIPLIER_UPDATES, MAX_RELAXED_STEP = _doubles(multipliers.MAX_MULTIPLIER_UPDATES, load_steps.MAX_RELAXED_STEP)
+MAX_CORRECTION_RATIO, MAX_RELAXED_UPDATE = _doubles(multipliers.MAX_CORRECTION_RATIO, multipliers.MAX_RELAXED_UPDATE)
+MESH, MAX_DEEP_PASSES = wp.constant(KINDS["mesh"]), wp.constant(multipliers.MAX_DEEP_PASSES)
 FIRST_VISCOSITY, LEAST_VISCOSITY = _doubles(newton.FIRST_VISCOSITY, newton.LEAST_VISCOSITY)
 MOST_VISCOSITY, LEAST_SHARE = _doubles(newton.MOST_VISCOSITY, newton.LEAST_SHARE)
 MIN_REACTION_RATIO, MAX_ERROR, AIM = _doubles(newton.MIN_REACTION_RATIO, newton.MAX_ERROR, newton.AIM)
@@ -44,7 +44,7 @@ FALL, FALL_AFTER_REFUSAL, RISE = _doubles(newton.FALL, newton.FALL_AFTER_REFUSAL
 
 @wp.func
 def next_viscosity(viscosity: wp.float64, error: wp.float64, refused: bool) -> wp.float64:
-    """`synth.simulate.newton.next_viscosity`."""
+    """`synth.simulate.policy.newton.next_viscosity`."""
     if error <= MAX_ERROR:
         taken = viscosity * wp.clamp(error / AIM, wp.where(refused, FALL_AFTER_REFUSAL, FALL), RISE)
         if taken < LEAST_VISCOSITY:
@@ -161,7 +161,7 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings, indenters: 
     relaxed = lanes.relaxing[s] > 0
     small = lanes.target[s] - lanes.at[s] <= MAX_RELAXED_STEP * settings.longest
     if correction:
-        small = lanes.share[s] < MAX_RELAXED_STEP and _is_deep(lanes, presses, s)
+        small = lanes.share[s] < MAX_RELAXED_UPDATE and _is_deep(lanes, presses, s)
     if phase == phases.FAILED and not relaxed and not polish and small:
         lanes.relaxing[s] = 1
         lanes.viscosity[s] = FIRST_VISCOSITY
