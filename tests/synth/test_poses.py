@@ -205,6 +205,7 @@ def test_on_a_round_gel_a_press_by_poses_is_that_by_motion_and_must_not_begin_wi
 def test_poses_stand_alone_and_are_simulated_one_by_one(tmp_path: Path) -> None:
     (tmp_path / "grasp.csv").write_text(HEAD + REST + "1,0,0,-3.7,0,0,0,1\n")  # two states: one pair
     path, poses = write_tiny(tmp_path), f'"{tmp_path}/grasp.csv"'
+    refused(r"^motion\.poses: .*nofile\.csv: cannot be read", load_scene, path, ['motion={ poses = "nofile.csv" }'])
     refused("leave out depth_mm", lambda: load_scene(path, [f"motion.poses={poses}"]))
     refused("steps = 7: 2 poses have 1", lambda: load_scene(path, [f"motion={{ poses = {poses}, steps = 7 }}"]))
     refused("motion: depth_mm is missing; give it, or poses", lambda: load_scene(path, ["motion={ steps = 2 }"]))
