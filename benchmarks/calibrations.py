@@ -115,7 +115,9 @@ def photographs(content: dict[str, Any], rng: np.random.Generator, out: Path) ->
     scene = validated(content, "known lights", Scene)
     sensor, render = scene.sensor, Render.model_validate(content["render"])
     depths, places = rng.uniform(*DEPTHS_MM, 4), np.array(PLACES_MM) + rng.uniform(-0.4, 0.4, (4, 2))
-    presses = [press_ball(sensor, RADIUS_MM, float(depth), place, 0.5) for depth, place in zip(depths, places, strict=True)]
+    presses = [
+        press_ball(sensor, RADIUS_MM, float(depth), place, 0.5) for depth, place in zip(depths, places, strict=True)
+    ]
     texture, still = albedo(sensor, rng), presses[0].surface
     faces = [(still, still.material)] * 3 + [(press.surface, press.positions) for press in presses]
     files = []
@@ -163,12 +165,15 @@ def differences(known: Sensor, found: list[dict[str, Any]]) -> Row:
         errors.append(np.abs(np.column_stack([turned, powers])))
     azimuth, elevation, power = np.vstack(errors).max(axis=0)
     within = azimuth <= AZIMUTH_DEG and elevation <= ELEVATION_DEG and power <= POWER
-    return {"azimuth_deg": float(azimuth), "elevation_deg": float(elevation), "power": float(power), "found": bool(within)}
+    return {
+        "azimuth_deg": float(azimuth),
+        "elevation_deg": float(elevation),
+        "power": float(power),
+        "found": bool(within),
+    }
 
 
 def _direction(place: FloatArray) -> FloatArray:
     """Azimuth and elevation (n, 2) in degrees of places (n, 3) from the gel's middle."""
     x, y, z = place.T
     return np.degrees(np.column_stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))]))
-
-

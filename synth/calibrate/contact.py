@@ -17,7 +17,7 @@ from synth.arrays import BoolArray, FloatArray, Pixels
 from synth.errors import InputError
 
 _BLUR_PX, _GRID = 2.0, 48
-"""Smoothing of the frames, and points of the search along the width of the image."""
+"""Smoothing in which contacts are sought, and points of the search along the width of the image."""
 _RADII = np.geomspace(0.05, 0.35, 16)
 """Radii that are tried, over the width of the image."""
 _INSIDE, _TOUCHING = 0.7, 0.85
@@ -40,10 +40,10 @@ class Contact:
         return np.asarray(np.hypot(x - self.middle[0], y - self.middle[1]) / self.radius)
 
 
-def change(frame: FloatArray, rest: FloatArray, bare: BoolArray) -> FloatArray:
+def change(frame: FloatArray, rest: FloatArray, bare: BoolArray, blur_px: float = _BLUR_PX) -> FloatArray:
     """What a press changes (H, W, 3) in levels of 255, smoothed over pixels (H, W) that are bare in both frames."""
-    weight = cv2.GaussianBlur(bare.astype(np.float64), (0, 0), _BLUR_PX)
-    blurred = cv2.GaussianBlur((frame - rest) * bare[:, :, None], (0, 0), _BLUR_PX)
+    weight = cv2.GaussianBlur(bare.astype(np.float64), (0, 0), blur_px)
+    blurred = cv2.GaussianBlur((frame - rest) * bare[:, :, None], (0, 0), blur_px)
     return np.asarray(255 * blurred / np.maximum(weight, 1e-3)[:, :, None])
 
 

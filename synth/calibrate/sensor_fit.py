@@ -74,16 +74,16 @@ def fit_sensor(
     target = _target(smooth, sensor.camera, pixels)
     shines = np.array([light.color for light in sensor.lights]) > 0
     room, vignetting = room_of(sensor), sensor.camera.vignetting
-    fit = fit_lights((gel,), target, LightGeometry.of(sensor.lights), shines, vignetting, room, steps)
+    fit = fit_lights(gel, target, LightGeometry.of(sensor.lights), shines, vignetting, room, steps)
     if steps > 0:
         clear = _clear_of_view(sensor, fit.geometry)
-        again = fit_lights((gel,), target, clear, shines, fit.vignetting, room, 0)
+        again = fit_lights(gel, target, clear, shines, fit.vignetting, room, 0)
         fit = replace(again, steps=fit.steps)
     pressed = None
     if balls is not None:
         beside = {name: bare & find_bare(sensor, frame) for name, frame in balls.frames.items()}
-        presses = find_presses(sensor, balls, smoothed(frames.encoded, bare), beside)
-        pressed = fit_balls(sensor, gel, target, fit, shines, room, presses, balls, variant, steps)
+        presses, series = find_presses(sensor, balls, smoothed(frames.encoded, bare), beside)
+        pressed = fit_balls(sensor, gel, target, fit, shines, room, presses, series, balls.judged, variant, steps)
         fit = pressed.lights
     read, shot = fit_noise(frames.single, bare, gamma, frames.step)
     noise: dict[str, Any] = {"read_noise": round(read, 6), "shot_noise": round(shot, 6)}
