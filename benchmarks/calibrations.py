@@ -1,18 +1,17 @@
 """How near does `synth calibrate --ball` come to lights that are known?
 
-Synthetic bare sensors of 160 x 120 px, three to eight lights in three colours around the view, are drawn by their number
-and the seed: azimuths, distances, heights, sizes and powers. Each gives three noisy frames at rest and four presses
-of a ball of 3 mm. The fit starts from as many lights, evenly spaced, turned by a random angle. calibrations.csv has a
-row per sensor: the largest error of its lights' azimuth and elevation, seen from the gel's middle, and of their power,
+Synthetic bare sensors of 160 x 120 px, with three to eight lights in three colours around the view, are drawn by their
+number and the seed: azimuths, distances, heights, sizes and powers. Each gives three noisy frames at rest and four
+presses of a ball of 3 mm. The fit starts from as many lights, evenly spaced, turned by a random angle.
+calibrations.csv has a row per sensor: the largest error of its lights' azimuth and elevation, seen from the gel's middle, and of their power,
 and whether these are within 5 degrees, 10 degrees and 10 per cent.
 """
 
 import contextlib
 import io
 import json
-import os
-import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +47,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(argv)
     cases = [{"seed": given.seed, "sensor": number} for number in range(given.n)]
-    rows = measure(given.out / "calibrations.csv", cases, calibrated)
+    rows = measure(given.out / "calibrations.csv", cases, partial(calibrated, given.out / "calibrations"))
     print(machine())
     show(rows, list(rows[0]), "Largest error of a sensor's lights")
     found = sum(row["found"] for row in rows)
@@ -95,7 +94,8 @@ def _light(
 def _scene(lights: list[dict[str, Any]]) -> dict[str, Any]:
     focal = 160 / VIEW_MM[0] * 30
     camera = {"width": 160, "height": 120, "fx": focal, "fy": focal, "cx": 80.0, "cy": 60.0, "gamma": 2.2,
-              "position_mm": [0.0, 0.0, 30.0], "look_at_mm": [0.0, 0.0, 0.0], "read_noise": 0.004, "shot_noise": 0.006}  # fmt: skip
+              "position_mm": [0.0, 0.0, 30.0], "look_at_mm": [0.0, 0.0, 0.0],
+              "read_noise": 0.004, "shot_noise": 0.006}  # fmt: skip
     sensor = {
         "gel": {"shape": "box", "size_mm": [18.0, 14.0, 2.5], "youngs_modulus_kpa": 200.0},
         "window": {"refractive_index": 1.41, "thickness_mm": 4.0},
@@ -128,22 +128,20 @@ def photographs(content: dict[str, Any], rng: np.random.Generator, out: Path) ->
     return files[:3], files[3:]
 
 
-def calibrated(case: Row) -> Row:
+def calibrated(out: Path, case: Row) -> Row:
     """A sensor's photographs, the command, and how far its lights are from the known ones."""
     known, start = drawn(case["seed"], case["sensor"])
-    folder = Path(os.environ.get("KEEP", "") or tempfile.mkdtemp()) / str(case["sensor"])
+    folder = out / f"{case['seed']}_{case['sensor']}"
     folder.mkdir(parents=True, exist_ok=True)
-    if True:
-        rest, balls = photographs(known, np.random.default_rng([case["seed"], case["sensor"], 1]), folder)
-        (folder / "start.toml").write_text(tomli_w.dumps(start))
-        (folder / "known.toml").write_text(tomli_w.dumps(known))
-        began = time.process_time()
-        files = ["--frames", *map(str, rest), "--ball", *map(str, balls), "--radius-mm", str(RADIUS_MM)]
-        with contextlib.redirect_stdout(io.StringIO()):
-            synth(["calibrate", "--scene", str(folder / "start.toml"), *files, "--out", str(folder / "fit")])
-        record = json.loads((folder / "fit" / "calibration.json").read_text())
-    sensors = [validated(known, "known", Scene).sensor]
-    row = differences(sensors[0], record["lights"])
+    rest, balls = photographs(known, np.random.default_rng([case["seed"], case["sensor"], 1]), folder)
+    (folder / "start.toml").write_text(tomli_w.dumps(start))
+    (folder / "known.toml").write_text(tomli_w.dumps(known))
+    began = time.process_time()
+    files = ["--frames", *map(str, rest), "--ball", *map(str, balls), "--radius-mm", str(RADIUS_MM)]
+    with contextlib.redirect_stdout(io.StringIO()):
+        synth(["calibrate", "--scene", str(folder / "start.toml"), *files, "--out", str(folder / "fit")])
+    record = json.loads((folder / "fit" / "calibration.json").read_text())
+    row = differences(validated(known, "known lights", Scene).sensor, record["lights"])
     return {"lights": len(known["sensor"]["lights"]), **row, "good": record["verdict"]["good"],
             "processor_s": time.process_time() - began}  # fmt: skip
 

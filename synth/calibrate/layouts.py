@@ -25,9 +25,9 @@ _TRIED, _ROUNDS, _CHUNK = 30, 2, 32
 
 def around(like: LightGeometry, room: Room) -> LightGeometry:
     """Lights around the gel, of the median size and viewing angle of others, no part of which is in the view."""
-    size, angle = np.median(like.size, axis=0), np.median(like.viewing_angle_deg, axis=0)
+    size, wide = np.median(like.size, axis=0), np.median(like.viewing_angle_deg, axis=0)
     aimed = np.degrees(np.arctan2(like.direction[:, 2], np.hypot(*like.direction[:, :2].T)))
-    tilts = (float(np.median(aimed)),) if angle[0] >= WIDEST_DEG else _TILTS
+    tilts = (float(np.median(aimed)),) if wide[0] >= WIDEST_DEG else _TILTS
     top, angles = room.high[:, 2].max(), np.radians(np.arange(_AZIMUTHS) * 360 / _AZIMUTHS)
     centres, directions = [], []
     for angle, height, tilt in product(angles, _HEIGHTS, np.radians(tilts)):
@@ -38,7 +38,7 @@ def around(like: LightGeometry, room: Room) -> LightGeometry:
         centres.append([*(outward * np.min(half / np.maximum(np.abs(outward), 1e-9))), z])
         directions.append([*(-outward * np.cos(tilt)), np.sin(tilt)])
     count = len(centres)
-    fields = np.array(centres), np.array(directions), np.tile(size, (count, 1)), np.tile(angle, (count, 1))
+    fields = np.array(centres), np.array(directions), np.tile(size, (count, 1)), np.tile(wide, (count, 1))
     outside = room.intrusion(LightGeometry(*fields)).max(axis=1) == 0
     return LightGeometry(*(field[outside] for field in fields))
 

@@ -55,7 +55,7 @@ class BallSeries:
     def face(self, pose: FloatArray) -> Points:
         """Vertices (v, 3) mm under a press with the pose (3,): its place, mm, and the logarithm of its depth in mm."""
         depth = np.clip(np.exp(pose[2]), 0, self.contacts[-1, 0])
-        return self.surface.positions(self.displacement(depth)) + [*pose[:2], 0.0]
+        return self.surface.positions(self.displacement(depth)) + np.append(pose[:2], 0.0)
 
     def depth_mm(self, contact_mm: float) -> float:
         """The depth at which a contact has this radius, at most the deepest."""
