@@ -3,8 +3,8 @@
 Synthetic bare sensors of 160 x 120 px, with three to eight lights in three colours around the view, are drawn by their
 number and the seed: azimuths, distances, heights, sizes and powers. Each gives three noisy frames at rest and four
 presses of a ball of 3 mm. The fit starts from as many lights, evenly spaced, turned by a random angle.
-calibrations.csv has a row per sensor: the largest error of its lights' azimuth and elevation, seen from the gel's middle, and of their power,
-and whether these are within 5 degrees, 10 degrees and 10 per cent.
+calibrations.csv has a row per sensor: the largest error of its lights' azimuth and elevation, seen from the gel's
+middle, and of their power, and whether these are within 5 degrees, 10 degrees and 10 per cent.
 """
 
 import contextlib

@@ -76,7 +76,10 @@ def find_contact(changed: FloatArray, name: str) -> Contact:
     y, x = np.mgrid[:height, :width] + 0.5
     simplex = best + np.vstack([np.zeros(3), np.diag([step, step, 0.1 * best[2]])])
     best = minimize(
-        lambda circle: -explained(circle)[0], best, method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": 80}
+        lambda circle: -explained(circle)[0],
+        best,
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "maxfev": 80},
     ).x
     _, share, rise = explained(best)
     if rise < _LEAST_RISE or share < _LEAST_EXPLAINED:

@@ -56,7 +56,9 @@ def test_light_on_tilted_faces_is_recovered_from_presses(tmp_path: Path) -> None
         before, after = 255 * rest.reshape(-1, 3)[::29], 255 * shown(gel, press.pixels) ** (1 / 2.2)
         presses.append(Press(press.name, press.contact, press.pixels, before, after - before, press.pose))
     pose = presses[-1].pose
-    presses[-1] = replace(presses[-1], pose=pose + np.array([0.2, -0.2, 0.2]))  # as lights that are not measured would have it
+    presses[-1] = replace(
+        presses[-1], pose=pose + np.array([0.2, -0.2, 0.2])
+    )  # as lights that are not measured would have it
     fit = LightFit(LightGeometry.of(lights), 300 * np.eye(3), 0.2, 0.0, 0, np.zeros((0, 3)))
     whole = SensorFit(sensor, fit, None, None, np.ones((120, 160), bool), BallFit(fit, tuple(presses), (), series))
     lit, model = fit_measured(whole, Frames(rest, rest, 1 / 255), frozenset({"b4"}), FAST)
