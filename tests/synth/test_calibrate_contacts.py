@@ -214,6 +214,10 @@ def test_known_lights_are_found_from_three_frames_at_rest_and_three_presses(tmp_
         assert max(contact["rms_within"]) < 6  # levels: as between frames, the camera's noise is 2
         assert np.abs(np.subtract(*contact["azimuth_deg"].values())).max() < 5
     assert record["verdict"]["good"]
+    given[given.index("--radius-mm") + 1] = 6
+    command = ["calibrate", "--scene", tmp_path / "start.toml", *given, "--steps", 8, "--out", tmp_path / "wrong"]
+    assert main(list(map(str, command))) == 2
+    assert "--radius-mm = 6: a ball of 3.6 mm explains the frames far better" in capsys.readouterr().err
 
 
 def test_a_long_light_across_a_corner_of_the_view_is_in_it() -> None:
