@@ -128,11 +128,12 @@ def _found(sensor: Sensor, balls: Balls, name: str, rest: FloatArray, bare: Bool
 def fit_balls(
     sensor: Sensor, gel: LitGel, target: Target, first: LightFit, shines: BoolArray, room: Room,
     presses: Sequence[Press], series: BallSeries, judged: frozenset[str], variant: Variant, steps: int,
+    clear: Callable[[LightGeometry], LightGeometry],
 ) -> BallFit:  # fmt: skip
     """Fit lights to the gel at rest, with its target, and to presses that are not only judged, with their poses.
 
-    They start from the fit to the gel at rest and from lights chosen all around; the best one is followed. The poses of
-    presses that are judged are found last.
+    They start from the fit to the gel at rest and from lights chosen all around; the best one is followed. `clear`
+    moves lights out of the view. The poses of presses that are judged are found last.
     """
 
     def change_at(press: Press) -> PressAt:
@@ -156,6 +157,8 @@ def fit_balls(
     fits = [fitted(start, min(steps, _SHORT), limits, poses, first.vignetting) for start, limits in tries]
     best = int(np.argmin([fit.residual for fit in fits]))
     fit = fitted(fits[best].geometry, steps, tries[best][1], fits[best].poses, fits[best].vignetting)
+    again = fitted(clear(fit.geometry), 0, tries[best][1], fit.poses, fit.vignetting)
+    fit = replace(again, steps=fit.steps)
 
     def model(one: PressAt, press: Press) -> FloatArray:
         """What a press changes under the lights as fitted, levels (n, 3)."""

@@ -44,7 +44,7 @@ INDEPENDENT = 300.0
 """Number of independent values that a smooth picture counts for, and so does what each press changes."""
 
 _SEEN_MM, _STEP = 0.05, 1e-4
-"""Standard deviation of a light's intrusion into the view, and the step of its derivatives in standard deviations."""
+"""Standard deviation of a light's intrusion into the view, without presses, and the step of its derivatives in standard deviations."""
 
 _DAMPINGS, _LEAST_GAIN = (0.0, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5), 3e-4
 """What is added to the curvature, in that of the prior; least share that a step must take off the misfit."""
@@ -185,6 +185,7 @@ class _Problem:
         self._own = 9 * self._lights + 1
         self.size = self._own + poses.size
         self._factor = float(np.sqrt(INDEPENDENT * (1 + len(presses)) / target.signal.size)) / RESIDUAL
+        self._seen_mm = _SEEN_MM / float(np.sqrt(1 + len(presses)))
 
     def geometry(self, theta: FloatArray) -> LightGeometry:
         centre, direction, size, angle = np.split(
@@ -222,7 +223,7 @@ class _Problem:
         """(3 n + len(theta) + 99 m,): weighted misfit by channel, the prior, and how far lights are in the view."""
         basis, powers, geometry = self._solved(theta)
         miss = np.einsum("mpc,mc->pc", basis, powers) - self._target.signal
-        seen = self._room.intrusion(geometry).ravel() / _SEEN_MM
+        seen = self._room.intrusion(geometry).ravel() / self._seen_mm
         return np.concatenate([(self._factor * self._target.slope * miss).T.ravel(), theta, seen])
 
     def jacobian(self, theta: FloatArray) -> FloatArray:
@@ -275,7 +276,7 @@ class _Problem:
         for k in range(9):
             move = np.append(np.tile(_STEP * np.eye(9)[k], self._lights), np.zeros(self.size - self._own + 1))
             more, less = (self._room.intrusion(self.geometry(theta + sign * move)) for sign in (1, -1))
-            found[number, :, number, k] = (more - less) / (2 * _STEP * _SEEN_MM)
+            found[number, :, number, k] = (more - less) / (2 * _STEP * self._seen_mm)
         return np.column_stack(
             [found.reshape(99 * self._lights, -1), np.zeros((99 * self._lights, self.size - self._own + 1))]
         )

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -87,11 +88,13 @@ def fit_sensor(
     pressed = None
     if balls is not None:
         beside = {name: bare & find_bare(sensor, frame) for name, frame in balls.frames.items()}
-        rest, first = smoothed(frames.encoded, bare), fit
+        rest, first, clear = smoothed(frames.encoded, bare), fit, partial(_clear_of_view, sensor)
 
         def pressed_by(ball: Balls, most: int) -> BallFit:
             presses, series = find_presses(sensor, ball, rest, beside)
-            return fit_balls(sensor, gel, target, first, shines, room, presses, series, ball.judged, variant, most)
+            return fit_balls(
+                sensor, gel, target, first, shines, room, presses, series, ball.judged, variant, most, clear
+            )
 
         pressed = pressed_by(balls, steps)
         _check_radius(pressed, balls, pressed_by)
