@@ -44,7 +44,7 @@ INDEPENDENT = 300.0
 """Number of independent values that a smooth picture counts for, and so does what each press changes."""
 
 _SEEN_MM, _STEP = 0.05, 1e-4
-"""Standard deviation of a light's intrusion into the view, without presses, and the step of its derivatives in standard deviations."""
+"""Standard deviation of a light's intrusion into the view, without presses, and the step of its derivatives in such."""
 
 _DAMPINGS, _LEAST_GAIN = (0.0, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5), 3e-4
 """What is added to the curvature, in that of the prior; least share that a step must take off the misfit."""

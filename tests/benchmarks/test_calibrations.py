@@ -19,5 +19,6 @@ def test_lights_are_drawn_by_number_and_compared_in_any_order() -> None:
     assert differences(sensor, found) == {"azimuth_deg": 0, "elevation_deg": 0, "power": 0, "found": True}
     found[0]["power_per_channel"] = [1.2 * part for part in found[0]["power_per_channel"]]
     row = differences(sensor, found)
-    assert row["power"] == pytest.approx(0.2) and not row["found"]
+    assert row["power"] == pytest.approx(0.2)
+    assert not row["found"]
     assert not differences(sensor, found[1:])["found"]  # a light is missing
