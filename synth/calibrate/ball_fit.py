@@ -138,9 +138,8 @@ def fit_balls(
 
     def change_at(press: Press) -> PressAt:
         flat = LitGel(sensor, press.pixels, variant)
-        return lambda pose: PressChange(
-            LitGel(sensor, press.pixels, variant, (series.surface, series.face(pose))), flat
-        )
+        lit = partial(LitGel, sensor, press.pixels, variant)
+        return lambda pose: PressChange(lit((series.surface, series.face(pose))), flat)
 
     def fitted(start: LightGeometry, most: int, limits: Room, poses: FloatArray, vignetting: float) -> LightFit:
         return fit_lights(gel, whole, start, shines, vignetting, limits, most, at, poses)
@@ -148,16 +147,21 @@ def fit_balls(
     told = [press for press in presses if press.name not in judged]
     whole, at = _with_changes(target, sensor, told), [change_at(press) for press in told]
     poses = np.array([press.pose for press in told])
-    changes = [one(pose) for one, pose in zip(at, poses, strict=True)]
-    like, tries = first.geometry, [(first.geometry, room)]
-    layout, reach = chosen((gel, *changes), whole, like, shines, first.vignetting, room), (room.high - room.low) / 2
-    low = np.maximum(layout.centre - reach, [-np.inf, -np.inf, room.low[:, 2].min()])
-    high = np.minimum(layout.centre + reach, [np.inf, np.inf, room.high[:, 2].max()])
-    tries.append((layout, replace(room, low=low, high=high)))
-    fits = [fitted(start, min(steps, _SHORT), limits, poses, first.vignetting) for start, limits in tries]
-    best = int(np.argmin([fit.residual for fit in fits]))
-    fit = fitted(fits[best].geometry, steps, tries[best][1], fits[best].poses, fits[best].vignetting)
-    again = fitted(clear(fit.geometry), 0, tries[best][1], fit.poses, fit.vignetting)
+    best, reach = (
+        (fitted(first.geometry, min(steps, _SHORT), room, poses, first.vignetting), room),
+        room.high - room.low,
+    )
+    for known in (False, True):  # poses as the contacts' circles tell them, then as the best fit has them
+        poses = best[0].poses if known else poses
+        gels = gel, *(one(pose) for one, pose in zip(at, poses, strict=True))
+        layout = chosen(gels, whole, first.geometry, shines, first.vignetting, room)
+        low = np.maximum(layout.centre - reach / 2, [-np.inf, -np.inf, room.low[:, 2].min()])
+        high = np.minimum(layout.centre + reach / 2, [np.inf, np.inf, room.high[:, 2].max()])
+        limits = replace(room, low=low, high=high)
+        other = fitted(layout, min(steps, _SHORT), limits, poses, first.vignetting)
+        best = min(best, (other, limits), key=lambda each: each[0].residual)
+    fit = fitted(best[0].geometry, steps, best[1], best[0].poses, best[0].vignetting)
+    again = fitted(clear(fit.geometry), 0, best[1], fit.poses, fit.vignetting)
     fit = replace(again, steps=fit.steps)
 
     def model(one: PressAt, press: Press) -> FloatArray:
@@ -188,10 +192,10 @@ def placed(press: Press, model: Callable[[Press], FloatArray]) -> Press:
     return replace(press, pose=minimize(misfit, press.pose, method="Nelder-Mead", options=options).x)
 
 
-def _with_changes(target: Target | None, sensor: Sensor, presses: Sequence[Press]) -> Target:
-    """The target at rest, if any, and what presses change after it."""
-    gamma, parts = sensor.camera.gamma, [] if target is None else [target]
-    signals, slopes, corners = ([getattr(part, name) for part in parts] for name in ("signal", "slope", "corner"))
+def _with_changes(target: Target, sensor: Sensor, presses: Sequence[Press]) -> Target:
+    """The target at rest, and what presses change after it."""
+    gamma = sensor.camera.gamma
+    signals, slopes, corners = [target.signal], [target.slope], [target.corner]
     for press in presses:
         before, after = (np.clip(level / 255, 2 / 255, 1) for level in (press.rest, press.rest + press.changed))
         slope = _WEIGHT * ((before + after) / 2) ** (1 - gamma) / gamma

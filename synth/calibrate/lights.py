@@ -119,7 +119,6 @@ def fit_lights(
     """Fit powers, geometry and vignetting to a target at the pixels of the gel at rest, and of presses after it.
 
     The presses' poses (k, 3) are fitted with the lights: lower lights colour flatter flanks alike.
-
     The geometry starts from `start`, the distance from which is what the prior penalises, and stays in the room.
     `shines` (m, 3) are the channels in which each light may have power. At most `steps` steps are taken; 0 fits the
     powers alone.
@@ -188,10 +187,8 @@ class _Problem:
         self._seen_mm = _SEEN_MM / float(np.sqrt(1 + len(presses)))
 
     def geometry(self, theta: FloatArray) -> LightGeometry:
-        centre, direction, size, angle = np.split(
-            theta[: self._own - 1].reshape(-1, 9) * self._scale, [3, 6, 8], axis=1
-        )
-        start = self._start
+        start, moved = self._start, theta[: self._own - 1].reshape(-1, 9) * self._scale
+        centre, direction, size, angle = np.split(moved, [3, 6, 8], axis=1)
         angles = start.viewing_angle_deg * np.exp(angle)
         return LightGeometry(start.centre + centre, start.direction + direction, start.size * np.exp(size), angles)
 
@@ -241,10 +238,8 @@ class _Problem:
         blocks = []
         for channel in range(3):
             moved = change[..., channel] * powers[:, None, None, channel]
-            columns = (
-                np.column_stack([moved.reshape(self._own - 1, -1).T, corner[:, channel], posed[..., channel].T])
-                * weight[:, channel, None]
-            )
+            parts = moved.reshape(self._own - 1, -1).T, corner[:, channel], posed[..., channel].T
+            columns = np.column_stack(parts) * weight[:, channel, None]
             lit = powers[:, channel] > 0
             if lit.any():
                 span = np.linalg.qr((basis[lit, :, channel] * weight[:, channel]).T)[0]
@@ -277,9 +272,7 @@ class _Problem:
             move = np.append(np.tile(_STEP * np.eye(9)[k], self._lights), np.zeros(self.size - self._own + 1))
             more, less = (self._room.intrusion(self.geometry(theta + sign * move)) for sign in (1, -1))
             found[number, :, number, k] = (more - less) / (2 * _STEP * self._seen_mm)
-        return np.column_stack(
-            [found.reshape(99 * self._lights, -1), np.zeros((99 * self._lights, self.size - self._own + 1))]
-        )
+        return np.pad(found.reshape(99 * self._lights, -1), ((0, 0), (0, self.size - self._own + 1)))
 
     def result(self, theta: FloatArray, steps: int) -> LightFit:
         basis, powers, geometry = self._solved(theta)
