@@ -88,7 +88,7 @@ def fit_sensor(
     pressed = None
     if balls is not None:
         beside = {name: bare & find_bare(sensor, frame) for name, frame in balls.frames.items()}
-        rest, first, clear = smoothed(frames.encoded, bare), fit, partial(_clear_of_view, sensor)
+        rest, first, moved = smoothed(frames.encoded, bare), fit, partial(_clear_of_view, sensor)
 
         def pressed_by(ball: Balls, most: int) -> BallFit:
             presses, series = find_presses(sensor, ball, rest, beside)
