@@ -93,7 +93,7 @@ def fit_sensor(
         def pressed_by(ball: Balls, most: int) -> BallFit:
             presses, series = find_presses(sensor, ball, rest, beside)
             return fit_balls(
-                sensor, gel, target, first, shines, room, presses, series, ball.judged, variant, most, clear
+                sensor, gel, target, first, shines, room, presses, series, ball.judged, variant, most, moved
             )
 
         pressed = pressed_by(balls, steps)
