@@ -25,10 +25,10 @@ from synth.dataset.shard import Shard
 from synth.dataset.tracks import states_columns
 from synth.pipeline.generate import Scheduling, generate
 from synth.planning import job_variant, plan, predict
+from synth.press.press import MeshRule
 from synth.render.renderer import Renderer
-from synth.scene.sampling import draw
+from synth.sampling import draw
 from synth.scene.template import Template, load_scene
-from synth.simulate.press import MeshRule
 from synth.simulate.solve import simulate_press
 from synth.verify import verify_dataset
 from synth.verify.camera import ForwardCamera
