@@ -23,6 +23,7 @@ QUESTIONS = {
     "scale": "pairs a second, and where the time goes",
     "throughput": "the main job on this machine: pairs a second, and what limits them",
     "round_gel": "the flow's error against run time for a round gel, by mesh",
+    "calibrations": "how near does calibration come to lights that are known?",
     "synthetic_set": "makes the synthetic test set of the report on gelflow",
     "methods": "flow methods' error against their time on one core, and their sigma",
     "paper": "the GelFlow paper's table, and its claims one by one",

@@ -1,8 +1,8 @@
 """Lights fitted to presses of a ball, together with the gel at rest: from several layouts, with place and depth."""
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.optimize import minimize
@@ -11,8 +11,8 @@ from synth.arrays import BoolArray, FloatArray, Pixels
 from synth.calibrate.contact import Contact, change, find_contact, flanks
 from synth.calibrate.irradiance import LightGeometry, LitGel, PressChange
 from synth.calibrate.layouts import chosen
-from synth.calibrate.lights import LightFit, Room, Target, fit_lights
-from synth.calibrate.pressed_ball import PressedBall, press_ball
+from synth.calibrate.lights import LightFit, PressAt, Room, Target, fit_lights
+from synth.calibrate.pressed_ball import BallSeries, PressedBall, press_ball, press_series
 from synth.errors import InputError
 from synth.optics import Optics
 from synth.render.camera_image import off_centre
@@ -26,11 +26,14 @@ _AROUND, _ACROSS = 1.7, 16
 """Pixels that count around a contact, over its radius, and how many across."""
 _MOVED_LEVELS = 10.0
 """Levels of 255 by which half of a frame may differ from the gel at rest beside the contact; auto-exposure takes 6."""
-_SIMULATIONS, _TOLERANCE = 22, 0.05
-"""Presses simulated to find one's place and depth, and how near (mm, and share of the depth) is enough."""
-_DEEPER, _SHORT = 0.1, 4
-"""Change of the depths' logarithm, and steps of the lights' fit, by which the depth of all presses is found. Lower
-lights colour flatter flanks alike, so that fitting one beside the other hardly moves either."""
+_TRIALS, _TOLERANCE = 60, 0.01
+"""Poses that are tried to find one press's, and how near (mm, and share of the depth) is enough."""
+_SHORT = 6
+"""Steps of the fits from each start, of which the best is followed."""
+_DEEPEST = 1.5
+"""Depth to which presses are simulated, over that of a sphere's cap as wide as the widest contact."""
+_SHARP_PX = 0.7
+"""Smoothing of the changes that lights are fitted to, which the model has not: more of it would flatten flanks."""
 _EDGE = 0.9
 """Share of the circle's radius within which flanks are measured."""
 
@@ -78,14 +81,22 @@ class BallFit:
     lights: LightFit
     presses: tuple[Press, ...]
     fitted: tuple[FloatArray, ...]
+    series: BallSeries
 
 
-def find_presses(sensor: Sensor, balls: Balls, rest: FloatArray, bare: dict[str, BoolArray]) -> tuple[Press, ...]:
-    """Contacts in all frames; InputError for one without, of another gel, or that the ball cannot make.
+def find_presses(
+    sensor: Sensor, balls: Balls, rest: FloatArray, bare: dict[str, BoolArray]
+) -> tuple[tuple[Press, ...], BallSeries]:
+    """Contacts in all frames, and the ball's faces; InputError for one without, of another gel, or of another ball.
 
     `rest` (H, W, 3) is the gel at rest, encoded; `bare` (H, W) are each frame's pixels beside dots.
     """
-    return tuple(_found(sensor, balls, name, rest, bare[name]) for name in balls.frames)
+    presses = [_found(sensor, balls, name, rest, bare[name]) for name in balls.frames]
+    wide = np.array([press.contact.radius for press in presses]) / pixels_per_mm(sensor)
+    series = press_series(sensor, balls.radius_mm, _DEEPEST * float(wide.max()) ** 2 / balls.radius_mm, balls.friction)
+    depths = np.log([series.depth_mm(radius) for radius in wide])
+    return tuple(replace(press, pose=np.array([*press.pose[:2], depth]))
+                 for press, depth in zip(presses, depths, strict=True)), series  # fmt: skip
 
 
 def _found(sensor: Sensor, balls: Balls, name: str, rest: FloatArray, bare: BoolArray) -> Press:
@@ -109,91 +120,82 @@ def _found(sensor: Sensor, balls: Balls, name: str, rest: FloatArray, bare: Bool
             f"--radius-mm = {balls.radius_mm:g} makes; check the radius"
         )
     place = Optics.of(sensor).look(np.array([contact.middle])).on_flat_face[0, :2]
-    depth = 0.7 * radius_mm**2 / balls.radius_mm
-    for _ in range(2):
-        ball = press_ball(sensor, balls.radius_mm, depth, place, balls.friction)
-        depth *= np.clip((radius_mm / max(ball.contact_mm, 1e-3)) ** 2, 0.4, 2.5)
     pixels = np.column_stack([columns, rows]).astype(np.float64) + 0.5
-    at_rest = 255 * rest[rows, columns]
-    return Press(name, contact, pixels, at_rest, changed[rows, columns], np.array([*place, np.log(depth)]))
+    at_rest, changed = 255 * rest[rows, columns], change(balls.frames[name], rest, bare, _SHARP_PX)
+    return Press(name, contact, pixels, at_rest, changed[rows, columns], np.array([*place, 0.0]))
 
 
 def fit_balls(
     sensor: Sensor, gel: LitGel, target: Target, first: LightFit, shines: BoolArray, room: Room,
-    presses: Sequence[Press], balls: Balls, variant: Variant, steps: int,
+    presses: Sequence[Press], series: BallSeries, judged: frozenset[str], variant: Variant, steps: int,
+    clear: Callable[[LightGeometry], LightGeometry],
 ) -> BallFit:  # fmt: skip
-    """Fit lights to the gel at rest, with its target, and to presses that are not only judged.
+    """Fit lights to the gel at rest, with its target, and to presses that are not only judged, with their poses.
 
-    They start from the fit to the gel at rest and from lights chosen all around; the better one is followed, with
-    the balls' places and depths found between two fits. Those of the presses that are judged are found last.
+    They start from the fit to the gel at rest and from lights chosen all around; the best one is followed. `clear`
+    moves lights out of the view. The poses of presses that are judged are found last.
     """
-    flats = {press.name: LitGel(sensor, press.pixels, variant) for press in presses}
 
-    def change_of(press: Press) -> PressChange:
-        ball = press.ball(sensor, balls)
-        return PressChange(LitGel(sensor, press.pixels, variant, (ball.surface, ball.positions)), flats[press.name])
+    def change_at(press: Press) -> PressAt:
+        flat = LitGel(sensor, press.pixels, variant)
+        lit = partial(LitGel, sensor, press.pixels, variant)
+        return lambda pose: PressChange(lit((series.surface, series.face(pose))), flat)
 
-    def fitted(start: LightGeometry, vignetting: float, most: int, limits: Room) -> LightFit:
-        return fit_lights((gel, *changes), whole, start, shines, vignetting, limits, most)
+    def fitted(start: LightGeometry, most: int, limits: Room, poses: FloatArray, vignetting: float) -> LightFit:
+        return fit_lights(gel, whole, start, shines, vignetting, limits, most, at, poses)
 
-    def deeper(presses: list[Press], by: float) -> list[Press]:
-        return [replace(press, pose=press.pose + np.array([0.0, 0.0, by])) for press in presses]
+    told = [press for press in presses if press.name not in judged]
+    whole, at = _with_changes(target, sensor, told), [change_at(press) for press in told]
+    poses = np.array([press.pose for press in told])
+    best, reach = (
+        (fitted(first.geometry, min(steps, _SHORT), room, poses, first.vignetting), room),
+        room.high - room.low,
+    )
+    for known in (False, True):  # poses as the contacts' circles tell them, then as the best fit has them
+        poses = best[0].poses if known else poses
+        gels = gel, *(one(pose) for one, pose in zip(at, poses, strict=True))
+        layout = chosen(gels, whole, first.geometry, shines, first.vignetting, room)
+        low = np.maximum(layout.centre - reach / 2, [-np.inf, -np.inf, room.low[:, 2].min()])
+        high = np.minimum(layout.centre + reach / 2, [np.inf, np.inf, room.high[:, 2].max()])
+        limits = replace(room, low=low, high=high)
+        other = fitted(layout, min(steps, _SHORT), limits, poses, first.vignetting)
+        best = min(best, (other, limits), key=lambda each: each[0].residual)
+    fit = fitted(best[0].geometry, steps, best[1], best[0].poses, best[0].vignetting)
+    again = fitted(clear(fit.geometry), 0, best[1], fit.poses, fit.vignetting)
+    fit = replace(again, steps=fit.steps)
 
-    def placed(press: Press, fit: LightFit) -> Press:
-        part = _with_changes(None, sensor, [press])
-        gain = (sensor.camera.exposure * (1 - fit.vignetting * part.corner))[:, None]
-
-        def misfit(pose: FloatArray) -> float:
-            try:
-                basis = change_of(replace(press, pose=pose)).contributions(fit.geometry)
-            except InputError:
-                return np.inf
-            miss = part.slope * (np.einsum("mpc,mc->pc", basis, fit.powers) * gain - part.signal)
-            return float(np.sum(miss**2))
-
-        simplex = press.pose + np.vstack([np.zeros(3), np.diag([0.2, 0.2, -0.25])])
-        options = {"maxfev": _SIMULATIONS, "initial_simplex": simplex, "xatol": _TOLERANCE, "fatol": 1e-9}
-        return replace(press, pose=minimize(misfit, press.pose, method="Nelder-Mead", options=options).x)
-
-    told = [press for press in presses if press.name not in balls.judged]
-    whole, changes = _with_changes(target, sensor, told), [change_of(press) for press in told]
-    like = first.geometry
-    everywhere = chosen((gel, *changes), whole, like, shines, first.vignetting, room)
-    reach = (room.high - room.low) / 2
-    low = np.maximum(everywhere.centre - reach, [-np.inf, -np.inf, room.low[:, 2].min()])
-    high = np.minimum(everywhere.centre + reach, [np.inf, np.inf, room.high[:, 2].max()])
-    rooms = room, replace(room, low=low, high=high)
-    fits = [fitted(start, first.vignetting, max(steps // 2, 1), limits)
-            for start, limits in zip((like, everywhere), rooms, strict=True)]  # fmt: skip
-    best = int(np.argmin([fit.residual for fit in fits]))
-    fit, told = fits[best], [placed(press, fits[best]) for press in told]
-    missed = np.full(3, np.inf)
-    for number, by in enumerate((-_DEEPER, 0.0, _DEEPER)):
-        with suppress(InputError):  # too deep for the gel
-            changes = [change_of(press) for press in deeper(told, by)]
-            missed[number] = fitted(fit.geometry, fit.vignetting, min(steps, _SHORT), rooms[best]).residual ** 2
-    at = float(np.argmin(missed) - 1)
-    if np.isfinite(missed).all() and missed[1] == missed.min():
-        at = 0.5 * (missed[0] - missed[2]) / (missed[0] - 2 * missed[1] + missed[2])  # the parabola's least
-    told = deeper(told, _DEEPER * at)
-    changes = [change_of(press) for press in told]
-    fit = fitted(fit.geometry, fit.vignetting, steps, rooms[best])
-    judged = [placed(press, fit) for press in presses if press.name in balls.judged]
-    models = []
-    for press in (*told, *judged):
+    def model(one: PressAt, press: Press) -> FloatArray:
+        """What a press changes under the lights as fitted, levels (n, 3)."""
         gain = target.gain * (1 - fit.vignetting * off_centre(sensor.camera, *press.pixels.T))
-        pressed = change_of(press)
-        before, more = (np.einsum("mpc,mc->pc", one.contributions(fit.geometry), fit.powers) * gain[:, None]
-                        for one in (pressed.rest, pressed))  # fmt: skip
+        pressed = one(press.pose)
+        before, more = (np.einsum("mpc,mc->pc", part.contributions(fit.geometry), fit.powers) * gain[:, None]
+                        for part in (pressed.rest, pressed))  # fmt: skip
         level = np.maximum(before, 0) ** (1 / sensor.camera.gamma)
-        models.append(255 * (np.maximum(before + more, 0) ** (1 / sensor.camera.gamma) - level))
-    return BallFit(fit, (*told, *judged), tuple(models))
+        return np.asarray(255 * (np.maximum(before + more, 0) ** (1 / sensor.camera.gamma) - level))
+
+    shown = [(replace(press, pose=pose), one) for press, pose, one in zip(told, fit.poses, at, strict=True)]
+    for press in presses:
+        if press.name in judged:
+            one = change_at(press)
+            shown.append((placed(press, partial(model, one)), one))
+    return BallFit(fit, tuple(press for press, _ in shown), tuple(model(one, press) for press, one in shown), series)
 
 
-def _with_changes(target: Target | None, sensor: Sensor, presses: Sequence[Press]) -> Target:
-    """The target at rest, if any, and what presses change after it."""
-    gamma, parts = sensor.camera.gamma, [] if target is None else [target]
-    signals, slopes, corners = ([getattr(part, name) for part in parts] for name in ("signal", "slope", "corner"))
+def placed(press: Press, model: Callable[[Press], FloatArray]) -> Press:
+    """The press at the pose whose change by a model, levels (n, 3), is nearest to the frame's."""
+
+    def misfit(pose: FloatArray) -> float:
+        return float(np.sum((model(replace(press, pose=pose)) - press.changed) ** 2))
+
+    simplex = press.pose + np.vstack([np.zeros(3), np.diag([0.2, 0.2, -0.25])])
+    options = {"maxfev": _TRIALS, "initial_simplex": simplex, "xatol": _TOLERANCE, "fatol": 1e-9}
+    return replace(press, pose=minimize(misfit, press.pose, method="Nelder-Mead", options=options).x)
+
+
+def _with_changes(target: Target, sensor: Sensor, presses: Sequence[Press]) -> Target:
+    """The target at rest, and what presses change after it."""
+    gamma = sensor.camera.gamma
+    signals, slopes, corners = [target.signal], [target.slope], [target.corner]
     for press in presses:
         before, after = (np.clip(level / 255, 2 / 255, 1) for level in (press.rest, press.rest + press.changed))
         slope = _WEIGHT * ((before + after) / 2) ** (1 - gamma) / gamma

@@ -12,12 +12,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.optimize import minimize
 
 from synth.arrays import BoolArray, FloatArray, Pixels
 from synth.errors import InputError
 
 _BLUR_PX, _GRID = 2.0, 48
-"""Smoothing of the frames, and points of the search along the width of the image."""
+"""Smoothing in which contacts are sought, and points of the search along the width of the image."""
 _RADII = np.geomspace(0.05, 0.35, 16)
 """Radii that are tried, over the width of the image."""
 _INSIDE, _TOUCHING = 0.7, 0.85
@@ -40,10 +41,10 @@ class Contact:
         return np.asarray(np.hypot(x - self.middle[0], y - self.middle[1]) / self.radius)
 
 
-def change(frame: FloatArray, rest: FloatArray, bare: BoolArray) -> FloatArray:
+def change(frame: FloatArray, rest: FloatArray, bare: BoolArray, blur_px: float = _BLUR_PX) -> FloatArray:
     """What a press changes (H, W, 3) in levels of 255, smoothed over pixels (H, W) that are bare in both frames."""
-    weight = cv2.GaussianBlur(bare.astype(np.float64), (0, 0), _BLUR_PX)
-    blurred = cv2.GaussianBlur((frame - rest) * bare[:, :, None], (0, 0), _BLUR_PX)
+    weight = cv2.GaussianBlur(bare.astype(np.float64), (0, 0), blur_px)
+    blurred = cv2.GaussianBlur((frame - rest) * bare[:, :, None], (0, 0), blur_px)
     return np.asarray(255 * blurred / np.maximum(weight, 1e-3)[:, :, None])
 
 
@@ -53,28 +54,39 @@ def find_contact(changed: FloatArray, name: str) -> Contact:
     step = max(1, width // _GRID)
     values = changed[step // 2 :: step, step // 2 :: step]
     y, x = np.mgrid[: values.shape[0], : values.shape[1]] * float(step) + step // 2 + 0.5
-    best: tuple[float, Contact, float, float] = (0.0, Contact((0, 0), 1), 0.0, 0.0)
-    for radius in _RADII * width:
-        for middle in np.stack([x, y], axis=-1)[::2, ::2].reshape(-1, 2):
-            inside = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 < radius**2
-            if inside.sum() < 8 or np.minimum(middle, [width - middle[0], height - middle[1]]).min() < radius * _INSIDE:
-                continue
-            columns = np.column_stack([np.ones(inside.sum()), x[inside] - middle[0], y[inside] - middle[1]])
-            within = values[inside]
-            normal, moment = columns.T @ columns, columns.T @ within
-            planes = np.linalg.solve(normal + 1e-9 * np.eye(3), moment)
-            tilted = float(np.sum(moment[1:] * planes[1:]))
-            missed = float(np.sum(within**2) - np.sum(moment * planes))
-            score = tilted - missed
-            if score > best[0]:
-                rise = radius * np.hypot(planes[1], planes[2]).max()
-                circle = Contact((float(middle[0]), float(middle[1])), float(_TOUCHING * radius))
-                best = score, circle, tilted / (tilted + missed), rise
-    if best[3] < _LEAST_RISE or best[2] < _LEAST_EXPLAINED:
+
+    def explained(circle: FloatArray) -> tuple[float, float, float]:
+        """What planes explain on a circle (x, y, radius) more than they miss, as a share too, and the rise there."""
+        middle, radius = circle[:2], circle[2]
+        inside = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 < radius**2
+        if inside.sum() < 8 or np.minimum(middle, [width - middle[0], height - middle[1]]).min() < radius * _INSIDE:
+            return 0.0, 0.0, 0.0
+        columns = np.column_stack([np.ones(inside.sum()), x[inside] - middle[0], y[inside] - middle[1]])
+        within = values[inside]
+        normal, moment = columns.T @ columns, columns.T @ within
+        planes = np.linalg.solve(normal + 1e-9 * np.eye(3), moment)
+        tilted = float(np.sum(moment[1:] * planes[1:]))
+        missed = float(np.sum(within**2) - np.sum(moment * planes))
+        return tilted - missed, tilted / max(tilted + missed, 1e-9), radius * float(np.hypot(*planes[1:]).max())
+
+    grid = np.stack([x, y], axis=-1)[::2, ::2].reshape(-1, 2)
+    tried = [np.append(middle, radius) for radius in _RADII * width for middle in grid]
+    best = max(tried, key=lambda circle: explained(circle)[0])
+    values = changed  # every pixel from here on
+    y, x = np.mgrid[:height, :width] + 0.5
+    simplex = best + np.vstack([np.zeros(3), np.diag([step, step, 0.1 * best[2]])])
+    best = minimize(
+        lambda circle: -explained(circle)[0],
+        best,
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "maxfev": 80},
+    ).x
+    _, share, rise = explained(best)
+    if rise < _LEAST_RISE or share < _LEAST_EXPLAINED:
         raise InputError(
             f"{name}: no ball's contact is seen in it; give frames of a ball pressed in, away from the edges"
         )
-    return best[1]
+    return Contact((float(best[0]), float(best[1])), float(_TOUCHING * best[2]))
 
 
 def flanks(pixels: Pixels, changed: FloatArray, contact: Contact) -> tuple[FloatArray, FloatArray]:

@@ -100,7 +100,8 @@ class LitGel:
         self._reflects = plane is not None
         self._index, self._face = mi.Float(sensor.window.refractive_index), mi.Float(plane or 0)
         color = {"type": "rgb", "value": list(sensor.coating.reflectance)}
-        self._bsdf = mi.load_dict(coat(sensor.coating, color))
+        self._bsdf = None if sensor.coating.is_matt else mi.load_dict(coat(sensor.coating, color))
+        self._albedo = np.array(sensor.coating.reflectance)
         self._returned = None
         if plane is not None and sensor.coating.is_matt:
             width, height = np.array(sensor.gel.size_mm[:2]) / _PATCHES
@@ -114,7 +115,7 @@ class LitGel:
             upward = np.tile([[0.0], [0], [1]], patches.shape[1])
             point, toward, normal = np.c_[point, patches], np.c_[toward, upward], np.c_[normal, upward]
             weight = np.r_[weight, np.ones(patches.shape[1])]
-        self._count, self._weight = len(weight), mi.Float(weight)
+        self._count, self._weight = len(weight), weight
         self._point, self._toward, self._normal = mi.Vector3f(point), mi.Vector3f(toward), mi.Vector3f(normal)
 
     def contributions(self, lights: LightGeometry, alone: bool = False) -> FloatArray:
@@ -139,15 +140,16 @@ class LitGel:
 
         A light's 9 numbers change its own contribution only, so all derivatives cost 9 pictures of each light.
         """
-        dr = self._dr
-        found, unshaded = [], self._all_unshaded(self._parts(lights))
+        dr, parts = self._dr, self._parts(lights)
+        unshaded = self._all_unshaded(parts)
+        dr.enable_grad(parts[:-1])
+        lit, found = self._lit(parts, unshaded), []
         for part, component in _NUMBERS:
-            parts = self._parts(lights)
-            dr.enable_grad(parts[:-1])
             dr.set_grad(parts[part][component], MIRROR[component] if part < 2 else 1)
-            lit = self._lit(parts, unshaded)
-            found.append(self._numpy(dr.forward_to(lit)))
-        return np.stack(found, axis=1)
+            found.append(dr.forward_to(lit, flags=dr.ADFlag.ClearVertices))
+            dr.clear_grad(lit)
+        dr.eval(found)  # one kernel, which computes what they share once
+        return np.stack([self._numpy(each) for each in found], axis=1)
 
     def _parts(self, lights: LightGeometry) -> tuple[Any, ...]:
         """Centres and directions in the renderer's frame, sizes, viewing angles, midpoints along the first size."""
@@ -221,32 +223,38 @@ class LitGel:
         return lit
 
     def _lit(self, parts: tuple[Any, ...], unshaded: tuple[Any, ...]) -> Any:
-        """Radiance (m n,) as mi.Color3f under each light of power 1 and its image in the window."""
+        """Radiance by each cell of each light of power 1 and its image in the window, as `_scattered`."""
         lit = self._scattered(parts, unshaded[0], is_image=False)
         return lit + self._scattered(self._image(parts), unshaded[1], is_image=True) if self._reflects else lit
 
     def _scattered(self, parts: tuple[Any, ...], unshaded: Any, is_image: bool) -> Any:
-        """Radiance (m n,) as mi.Color3f under rectangles, or under images of them that the window weakens."""
+        """Radiance by cells of rectangles, or of images of them that the window weakens.
+
+        A matt coating's is mi.Float, for a white one; others' is mi.Color3f.
+        """
         mi, dr = self._mi, self._dr
         arm, pixel, light, facing = self._arms(parts)
         square = dr.squared_norm(arm)
         away = arm / dr.sqrt(square)
-        interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(arm))
-        frame = mi.Frame3f(dr.gather(mi.Vector3f, self._normal, pixel))
-        interaction.wi = frame.to_local(dr.gather(mi.Vector3f, self._toward, pixel))
-        scattered = self._bsdf.eval(mi.BSDFContext(), interaction, frame.to_local(away))
+        normal = dr.gather(mi.Vector3f, self._normal, pixel)
+        if self._bsdf is None:
+            scattered = dr.maximum(dr.dot(normal, away), 0) / dr.pi
+        else:
+            interaction, frame = dr.zeros(mi.SurfaceInteraction3f, dr.width(arm)), mi.Frame3f(normal)
+            interaction.wi = frame.to_local(dr.gather(mi.Vector3f, self._toward, pixel))
+            scattered = self._bsdf.eval(mi.BSDFContext(), interaction, frame.to_local(away))
         power = -dr.log(2) / dr.log(dr.cos(dr.deg2rad(parts[3][0] / 2)))  # of the intensity: Light.narrowness + 1
         share = unshaded * reflectance(dr.abs(away.z), self._index, mi) if is_image else unshaded
         cosine = dr.power(dr.maximum(-dr.dot(away, facing), 1e-6), dr.gather(mi.Float, power, light)) * share
-        each = scattered * (cosine * dr.gather(mi.Float, power + 1, light) / (square * (2 * dr.pi * _CELLS)))
-        weight = dr.tile(self._weight, dr.width(parts[0]))
-        return mi.Color3f(*(dr.block_sum(each[k], _CELLS) * weight for k in range(3)))
+        return scattered * (cosine * dr.gather(mi.Float, power + 1, light) / (square * (2 * dr.pi * _CELLS)))
 
-    def _numpy(self, color: Any) -> FloatArray:
-        """(m, n, 3)."""
-        self._dr.eval(color)  # one kernel, not one for each channel
-        stacked = np.stack([np.array(color[k], dtype=np.float64) for k in range(3)], axis=1)
-        whole = stacked.reshape(-1, self._count, 3)
+    def _numpy(self, cells: Any) -> FloatArray:
+        """(m, n, 3): radiance on the camera's side of the window, of `_lit`."""
+        dr = self._dr
+        sums = [dr.block_sum(each, _CELLS) for each in ((cells,) if self._bsdf is None else cells)]
+        dr.eval(sums)
+        whole = np.stack([np.array(each, dtype=np.float64).reshape(-1, self._count) for each in sums], axis=-1)
+        whole = whole * self._weight[:, None] * (self._albedo if self._bsdf is None else 1.0)
         seen, patches = whole[:, : self._pixels], whole[:, self._pixels :]
         return (
             seen if self._returned is None else seen + np.einsum("npc,mpc->mnc", self._returned, patches, optimize=True)

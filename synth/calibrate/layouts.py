@@ -11,10 +11,13 @@ from scipy.optimize import nnls
 
 from synth.arrays import BoolArray, FloatArray
 from synth.calibrate.irradiance import LightGeometry
-from synth.calibrate.lights import Gels, Room, Target, contributions
+from synth.calibrate.lights import WIDEST_DEG, Gels, Room, Target, contributions
 
-_AZIMUTHS, _HEIGHTS, _TILTS = 24, (0.15, 0.35, 0.6, 0.85), (-45.0, -20.0, 0.0, 15.0)
-"""Lights around the gel, their heights over the body's, and the elevations (degrees) of where they aim."""
+_AZIMUTHS, _HEIGHTS = 24, (0.15, 0.35, 0.6, 0.85)
+"""Lights around the gel, and their heights over the body's."""
+_TILTS = (-45.0, -20.0, 0.0, 15.0)
+"""Elevations (degrees) of where narrow ones aim. Wide ones aim as high as the preset's: that hardly shows in what they
+light, and scales their power."""
 _BESIDE_MM, _APART_MM = 1.0, 2.0
 """How far lights are outside the view, and from each other."""
 _TRIED, _ROUNDS, _CHUNK = 30, 2, 32
@@ -22,18 +25,20 @@ _TRIED, _ROUNDS, _CHUNK = 30, 2, 32
 
 def around(like: LightGeometry, room: Room) -> LightGeometry:
     """Lights around the gel, of the median size and viewing angle of others, no part of which is in the view."""
+    size, wide = np.median(like.size, axis=0), np.median(like.viewing_angle_deg, axis=0)
+    aimed = np.degrees(np.arctan2(like.direction[:, 2], np.hypot(*like.direction[:, :2].T)))
+    tilts = (float(np.median(aimed)),) if wide[0] >= WIDEST_DEG else _TILTS
     top, angles = room.high[:, 2].max(), np.radians(np.arange(_AZIMUTHS) * 360 / _AZIMUTHS)
     centres, directions = [], []
-    for angle, height, tilt in product(angles, _HEIGHTS, np.radians(_TILTS)):
+    for angle, height, tilt in product(angles, _HEIGHTS, np.radians(tilts)):
         outward = np.array([np.cos(angle), np.sin(angle)])
         z = height * top
         low, high = room.view + z * room.slope
         half = np.maximum(-low, high) + _BESIDE_MM
         centres.append([*(outward * np.min(half / np.maximum(np.abs(outward), 1e-9))), z])
         directions.append([*(-outward * np.cos(tilt)), np.sin(tilt)])
-    size, angle = np.median(like.size, axis=0), np.median(like.viewing_angle_deg, axis=0)
     count = len(centres)
-    fields = np.array(centres), np.array(directions), np.tile(size, (count, 1)), np.tile(angle, (count, 1))
+    fields = np.array(centres), np.array(directions), np.tile(size, (count, 1)), np.tile(wide, (count, 1))
     outside = room.intrusion(LightGeometry(*fields)).max(axis=1) == 0
     return LightGeometry(*(field[outside] for field in fields))
 

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from synth.arrays import FloatArray, Image
-from synth.calibrate.ball_fit import BallFit, Balls, Press
+from synth.calibrate.ball_fit import BallFit, Press, placed
 from synth.calibrate.frames import Frames
 from synth.calibrate.irradiance import LightGeometry, LitGel
 from synth.calibrate.sensor_fit import SensorFit, smoothed
@@ -39,20 +39,21 @@ _FORMS, _COARSE = 10, 1
 """Numbers of A, b and c; px a texel of the flat field."""
 
 
-def fit_measured(fit: SensorFit, frames: Frames, balls: Balls, variant: Variant) -> tuple[SensorFit, LightModel]:
+def fit_measured(
+    fit: SensorFit, frames: Frames, judged: frozenset[str], variant: Variant
+) -> tuple[SensorFit, LightModel]:
     """The fitted sensor with its light measured, and that light; `fit` is of the frames, and of the balls' presses.
 
     Places and depths of the presses are found anew, together with the light: what lights could not describe, they met
     with other depths.
     """
     assert fit.pressed is not None
-    sensor, gamma = fit.sensor, fit.sensor.camera.gamma
-    side, told = _side(sensor), [press for press in fit.pressed.presses if press.name not in balls.judged]
+    sensor, gamma, series = fit.sensor, fit.sensor.camera.gamma, fit.pressed.series
+    side, told = _side(sensor), [press for press in fit.pressed.presses if press.name not in judged]
 
     def rows(press: Press, lights: Sequence[Light]) -> FloatArray:
         """(m, n, 10 terms): what each coefficient of the lights' channels adds at the press's pixels, linear."""
-        ball = press.ball(sensor, balls)
-        gel = LitGel(sensor, press.pixels, variant, (ball.surface, ball.positions))
+        gel = LitGel(sensor, press.pixels, variant, (series.surface, series.face(press.pose)))
         weight = gel.visible(LightGeometry.of(lights)) * np.tile(_linear(press.rest, gamma).T, (len(lights) // 3, 1))
         return weight[..., None] * _basis(gel.points[:, :2] / side.min(), gel.normals)
 
@@ -64,12 +65,13 @@ def fit_measured(fit: SensorFit, frames: Frames, balls: Balls, variant: Variant)
                   for k in range(0, len(tried), 3)]  # fmt: skip
         leads = [tried[3 * best + channel] for channel, best in enumerate(np.argmin(missed, axis=0))]
         told, coefficients = _solved(told, partial(rows, lights=leads), gamma)
-    at = {press.name: press for press in told}
-    presses = tuple(at.get(press.name, press) for press in fit.pressed.presses)
-    changed = []
-    for press in presses:
+
+    def model(press: Press) -> FloatArray:
         value = np.maximum(np.einsum("cnk,ck->nc", rows(press, leads), coefficients), 0)
-        changed.append(255 * value ** (1 / gamma) - press.rest)
+        return np.asarray(255 * value ** (1 / gamma) - press.rest)
+
+    at = {press.name: press for press in told}
+    presses = tuple(at.get(press.name) or placed(press, model) for press in fit.pressed.presses)
     lights = [light.model_copy(update={"power": 1.0, "color": tuple(np.eye(3)[c].tolist())})
               for c, light in enumerate(leads)]  # fmt: skip
     measured = MeasuredLight(file=FILE, flat_field=FLAT)
@@ -77,7 +79,7 @@ def fit_measured(fit: SensorFit, frames: Frames, balls: Balls, variant: Variant)
     model = LightModel(
         coefficients.reshape(3, _FORMS, -1), (float(side[0]), float(side[1])), _flat(sensor, frames, fit, side)
     )
-    return replace(fit, sensor=lit, pressed=BallFit(fit.lights, presses, tuple(changed))), model
+    return replace(fit, sensor=lit, pressed=BallFit(fit.lights, presses, tuple(map(model, presses)), series)), model
 
 
 def _solved(presses: list[Press], rows: Callable[[Press], FloatArray], gamma: float) -> tuple[list[Press], FloatArray]:

@@ -81,7 +81,7 @@ def run_calibrate(
     fit = fit_sensor(start, given, variant, spacing_mm, steps, balls)
     render, light = render_settings(template), None
     if measured and balls is not None:
-        fit, light = fit_measured(fit, given, balls, variant)
+        fit, light = fit_measured(fit, given, balls.judged, variant)
         render = render.model_copy(update={"light": "separated"})
     show = partial(render_gel, fit.sensor, render, variant, light)
     rows, grids = _compared(fit, show(), given, others)

@@ -1,6 +1,9 @@
 """A sensor fitted to frames of its undeformed gel: layout and camera first, then dots, lights and noise."""
 
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -31,6 +34,9 @@ _VIEW_MM = 0.3
 """Lights stay so far outside the camera's view."""
 _PUSH_MM, _LONGEST_PUSH = 0.25, 40
 """Length of a step by which a light in the view is moved outward, and most such steps."""
+_DOUBTED, _SMALLER, _BETTER, _CHECKING = 3 / 255, 0.6, 0.7, 6
+"""Residual beyond which the ball's radius is doubted, share of it that is tried, share of the residual by which that
+one is better, and steps of its fit."""
 _DARKEST, _BRIGHTEST = 2 / 255, 253 / 255
 """Encoded values beyond these are clipped and tell nothing."""
 
@@ -74,16 +80,24 @@ def fit_sensor(
     target = _target(smooth, sensor.camera, pixels)
     shines = np.array([light.color for light in sensor.lights]) > 0
     room, vignetting = room_of(sensor), sensor.camera.vignetting
-    fit = fit_lights((gel,), target, LightGeometry.of(sensor.lights), shines, vignetting, room, steps)
+    fit = fit_lights(gel, target, LightGeometry.of(sensor.lights), shines, vignetting, room, steps)
     if steps > 0:
         clear = _clear_of_view(sensor, fit.geometry)
-        again = fit_lights((gel,), target, clear, shines, fit.vignetting, room, 0)
+        again = fit_lights(gel, target, clear, shines, fit.vignetting, room, 0)
         fit = replace(again, steps=fit.steps)
     pressed = None
     if balls is not None:
         beside = {name: bare & find_bare(sensor, frame) for name, frame in balls.frames.items()}
-        presses = find_presses(sensor, balls, smoothed(frames.encoded, bare), beside)
-        pressed = fit_balls(sensor, gel, target, fit, shines, room, presses, balls, variant, steps)
+        rest, first, moved = smoothed(frames.encoded, bare), fit, partial(_clear_of_view, sensor)
+
+        def pressed_by(ball: Balls, most: int) -> BallFit:
+            presses, series = find_presses(sensor, ball, rest, beside)
+            return fit_balls(
+                sensor, gel, target, first, shines, room, presses, series, ball.judged, variant, most, moved
+            )
+
+        pressed = pressed_by(balls, steps)
+        _check_radius(pressed, balls, pressed_by)
         fit = pressed.lights
     read, shot = fit_noise(frames.single, bare, gamma, frames.step)
     noise: dict[str, Any] = {"read_noise": round(read, 6), "shot_noise": round(shot, 6)}
@@ -94,6 +108,24 @@ def fit_sensor(
     lights = tuple(_shining(_placed(sensor.lights[i], fit.geometry, i), fit.powers[i]) for i in lit)
     sensor = sensor.model_copy(update={"camera": camera, "lights": lights})
     return SensorFit(sensor, fit, dots, grid, bare, pressed)
+
+
+def _check_radius(fit: BallFit, balls: Balls, fitted: Callable[[Balls, int], BallFit]) -> None:
+    """InputError where a poor fit becomes far better with a smaller ball.
+
+    The nearer the lights, the better they tell the radius: far ones light a flatter gel from lower alike (bas-relief
+    ambiguity; Belhumeur, Kriegman and Yuille, IJCV 35, 1999).
+    """
+    if fit.lights.residual < _DOUBTED:
+        return
+    other, residual = replace(balls, radius_mm=_SMALLER * balls.radius_mm), np.inf
+    with suppress(InputError):  # contacts are too wide for the smaller ball
+        residual = fitted(other, _CHECKING).lights.residual
+    if residual < _BETTER * fit.lights.residual:
+        raise InputError(
+            f"--radius-mm = {balls.radius_mm:g}: a ball of {other.radius_mm:.2g} mm explains the frames far better "
+            f"({255 * residual:.1f} instead of {255 * fit.lights.residual:.1f} levels are left); check the radius"
+        )
 
 
 def find_grid(

@@ -54,11 +54,10 @@ def add_clip(out: Path, clips: dict[str, ClipData]) -> None:
     columns |= dict(zip(NUMBERED, ((np.arange(frames) / rate).astype(np.float32), *counted), strict=True))
     features, arrays = {}, {}
     for name, values in columns.items():
-        is_image = name.startswith("observation.images.")
-        arrays[name] = _pictures(pa, values) if is_image else _nested(pa, values)
-        axes = ["height", "width", "channels"] if is_image else None
-        shape = list(values.shape[1:]) or [1]
-        features[name] = {"dtype": "image" if is_image else str(values.dtype), "shape": shape, "names": axes}
+        kind = "image" if name.startswith("observation.images.") else str(values.dtype)
+        axes = ["height", "width", "channels"] if kind == "image" else None
+        features[name] = {"dtype": kind, "shape": list(values.shape[1:]) or [1], "names": axes}
+        arrays[name] = _array(pa, values, kind)
     episode = {
         "episode_index": number, "tasks": [clip.meta["scene"]["name"]], "length": frames, "dataset_from_index": first,
         "meta": to_document(clip.meta),
@@ -69,11 +68,9 @@ def add_clip(out: Path, clips: dict[str, ClipData]) -> None:
         path = out / folder / PATH.format(**place)
         path.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(table, path)
-    kinds = (("task_index", "int64", "int64"), ("task", "unicode", "object"))
-    described = [
-        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": stored, "metadata": None}
-        for name, kind, stored in kinds
-    ]
+    kinds = {"task_index": "int64", "task": "object"}
+    described = [{"name": name, "field_name": name, "pandas_type": kind, "numpy_type": kind, "metadata": None}
+                 for name, kind in kinds.items()]  # fmt: skip
     index = {"pandas": json.dumps({"index_columns": ["task"], "columns": described, "column_indexes": []})}
     task = pa.table({"task_index": pa.array([0]), "task": pa.array(episode["tasks"])})
     pq.write_table(task.replace_schema_metadata(index), meta / "tasks.parquet")
@@ -105,35 +102,28 @@ def _columns(clips: dict[str, ClipData]) -> dict[str, NDArray[Any]]:
     return found
 
 
-def _pictures(pa: Any, values: NDArray[Any]) -> Any:
-    files = [{"bytes": encode_png(picture), "path": f"{k:06d}.png"} for k, picture in enumerate(values)]
-    return pa.array(files, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
-
-
-def _nested(pa: Any, values: NDArray[Any]) -> Any:
-    """Arrays (frames, ...) as lists of lists."""
+def _array(pa: Any, values: NDArray[Any], kind: str) -> Any:
+    """Pictures as files, other arrays (frames, ...) as lists of lists."""
+    if kind == "image":
+        files = [{"bytes": encode_png(picture), "path": f"{k:06d}.png"} for k, picture in enumerate(values)]
+        return pa.array(files, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
     found = pa.array(np.ascontiguousarray(values).ravel())
-    for axis in range(values.ndim - 1, 0, -1):
-        step = values.shape[axis]
+    for step in values.shape[:0:-1]:
         found = pa.ListArray.from_arrays(pa.array(np.arange(0, len(found) + 1, step, dtype=np.int32)), found)
     return found
 
 
 def _merged(before: dict[str, Any] | None, values: NDArray[Any]) -> dict[str, Any]:
-    """Statistics of all frames so far: of a picture those of its channels, from 0 to 1, (3, 1, 1)."""
-    if values.ndim == 4:
-        values = values.transpose(0, 3, 1, 2) / 255
-    axes = (0, 2, 3) if values.ndim == 4 else (0,)
-    keep = {"axis": axes, "keepdims": values.ndim == 4}
-    now = {name: getattr(values, name)(**keep).reshape(-1) for name in ("min", "max", "mean", "var")}
-    old = {k: np.reshape(v, -1) for k, v in (before or {}).items()}
-    n, m = int(old["count"][0]) if before else 0, len(values)
-    if before:
-        mean, var = old["mean"], old["std"] ** 2
-        both = (n * mean + m * now["mean"]) / (n + m)
-        spread = n * (var + (mean - both) ** 2) + m * (now["var"] + (now["mean"] - both) ** 2)
-        now = {"min": np.minimum(old["min"], now["min"]), "max": np.maximum(old["max"], now["max"]), "mean": both,
-               "var": spread / (n + m)}  # fmt: skip
-    now["std"] = np.sqrt(now.pop("var"))
-    shape = (-1, 1, 1) if values.ndim == 4 else (-1,)
-    return {**{name: value.reshape(shape).tolist() for name, value in now.items()}, "count": [n + m]}
+    """Statistics of all frames so far: of pictures those of their channels, from 0 to 1, (3, 1, 1)."""
+    frames, shape = len(values), (3, 1, 1) if values.ndim == 4 else (-1,)
+    values = values.reshape(-1, values.shape[-1]) / (255 if values.ndim == 4 else 1)
+    old = before or {"min": np.inf, "max": -np.inf, "mean": 0.0, "std": 0.0, "count": [0]}
+    low, high, mean, deviation = (np.ravel(old[name]) for name in ("min", "max", "mean", "std"))
+    count = old["count"][0] + frames
+    new = frames / count
+    average = (1 - new) * mean + new * values.mean(axis=0)
+    spread = (1 - new) * (deviation**2 + (mean - average) ** 2)
+    spread += new * (values.var(axis=0) + (values.mean(axis=0) - average) ** 2)
+    found = np.minimum(low, values.min(axis=0)), np.maximum(high, values.max(axis=0)), average, np.sqrt(spread)
+    named = zip(("min", "max", "mean", "std"), found, strict=True)
+    return {**{name: value.reshape(shape).tolist() for name, value in named}, "count": [count]}

@@ -26,7 +26,8 @@ def _film(clip: ClipData) -> Panel:
     strip = _frames(clip, evenly_spaced(len(clip), count))
     strip += [np.full_like(strip[0], 255)] * (count - len(strip))
     rows = [np.concatenate(strip[at : at + 2], axis=1) for at in range(0, count, 2)]
-    rate = clip.meta["scene"]["sampling"]["frames_per_second"]
+    time = clip.states["time_s"]
+    rate = float((len(clip) - 1) / (time[-1] - time[0]))
     caption = f"frames 0 to {len(clip) - 1}, {rate:g} a second: image, and flow from frame 0"
     return Panel(caption, np.concatenate(rows), film=lambda: _frames(clip, list(range(len(clip)))), rate=rate)
 

@@ -99,16 +99,18 @@ class RigidBody:
         rounding, *lengths = map(float, self.shape)
         match KIND_NAMES[self.kind]:
             case "sphere":
-                return lengths[0]
+                reach = lengths[0]
             case "cylinder":
-                return lengths[0] * radial + lengths[1] * abs(axial) + rounding
+                reach = lengths[0] * radial + lengths[1] * abs(axial) + rounding
             case "box":
-                return float(np.abs(direction) @ lengths[:3]) + rounding
+                reach = float(np.abs(direction) @ lengths[:3]) + rounding
             case "cone":
-                return max(0.0, lengths[0] * radial - lengths[1] * axial) + rounding
+                reach = max(0.0, lengths[0] * radial - lengths[1] * axial) + rounding
             case "torus":
-                return lengths[0] * radial + rounding
-        return float((self.corners @ direction).max())
+                reach = lengths[0] * radial + rounding
+            case "mesh":
+                return float((self.corners @ direction).max())
+        return reach - float(self.shape[5:] @ direction)
 
     @property
     def sharpness(self) -> float:
@@ -162,7 +164,7 @@ def rigid_body(
             lengths, sharpest = [tube, radius], tube
     shape = np.zeros(SHAPE_LENGTH)
     shape[: len(lengths)] = lengths
-    shape[5:] = rotation.T @ (rotation @ indenter.offset_mm * [1, 1, 0])
+    shape[5:] = rotation.T @ (rotation @ indenter.offset_mm * [1, 1, int(touchable.box is not None)])
     body = RigidBody(KINDS[indenter.shape], shape, rotation, 0.0, np.zeros((1, 1, 1)), sharpest, fillet)
     return replace(body, reach_mm=body.reach_along(rotation[2]))
 

@@ -40,22 +40,15 @@ class PosedPath(LoadPath):
     gel: Gel = field(kw_only=True)
 
     @cached_property
-    def _places(self) -> FloatArray:
-        """(k, 3) mm of the body's origin."""
-        return np.array(self.motion.poses)[:, 1:4]
-
-    @cached_property
-    def _turns(self) -> FloatArray:
-        """(k, 3, 3) of the body's frame."""
-        return turns_of(self.motion)
+    def _poses(self) -> tuple[FloatArray, FloatArray]:
+        return poses_of(self.motion)
 
     @cached_property
     def _moving(self) -> FloatArray:
         """(k - 1, 6): in each leg the motion of the body's point over the gel, mm, and the rotation vector, rad."""
-        half = np.array([self.gel.size_mm[0] / 2, self.gel.size_mm[1] / 2])
-        before = np.column_stack([np.clip(self._places[:-1, :2], -half, half), np.zeros(len(self._places) - 1)])
-        turn = self._turns[1:] @ self._turns[:-1].transpose(0, 2, 1)
-        after = self._places[1:] + np.einsum("kij,kj->ki", turn, before - self._places[:-1])
+        (places, turns), half = self._poses, np.array([*self.gel.size_mm[:2], 0.0]) / 2
+        turn, before = turns[1:] @ turns[:-1].transpose(0, 2, 1), np.clip(places[:-1], -half, half)
+        after = places[1:] + np.einsum("kij,kj->ki", turn, before - places[:-1])
         return np.column_stack([after - before, Rotation.from_matrix(turn).as_rotvec()])
 
     @cached_property
@@ -70,14 +63,9 @@ class PosedPath(LoadPath):
         turns = self.ends[1:-1][np.linalg.norm(np.diff(along, axis=0), axis=1) > TURN]
         return bool(np.any((turns > before) & (turns <= now)))
 
-    @property
-    def press_mm(self) -> float:
-        """There is no leg of a press."""
-        return 0.0
-
-    @property
-    def may_touch(self) -> bool:
-        return True
+    press_mm = 0.0
+    """There is no leg of a press."""
+    may_touch = True
 
     @cached_property
     def depth_scale_mm(self) -> float:
@@ -89,13 +77,14 @@ class PosedPath(LoadPath):
         Depth is that of its lowest point below z = 0, shear the way of its origin since the first pose, and twist the
         turn about z that is nearest to its turn since then.
         """
+        places, turns = self._poses
         leg = int(np.clip(np.searchsorted(self.ends, s, side="right") - 1, 0, len(self.ends) - 2))
         share = (s - self.ends[leg]) / (self.ends[leg + 1] - self.ends[leg])
-        centre = (1 - share) * self._places[leg] + share * self._places[leg + 1]
-        turn = Rotation.from_rotvec(share * self._moving[leg, 3:]).as_matrix() @ self._turns[leg]
-        since = turn @ self._turns[0].T
+        centre = (1 - share) * places[leg] + share * places[leg + 1]
+        turn = Rotation.from_rotvec(share * self._moving[leg, 3:]).as_matrix() @ turns[leg]
+        since = turn @ turns[0].T
         twist = float(np.degrees(np.arctan2(since[1, 0] - since[0, 1], since[0, 0] + since[1, 1])))
-        x, y, _ = map(float, centre - self._places[0])
+        x, y, _ = map(float, centre - places[0])
         rotation = turn @ self.body.rotation
         return Pose(float(centre[2]) + self.body.reach_along(rotation[2]), (x, y), twist, centre, rotation)
 
@@ -125,15 +114,16 @@ class PosedPath(LoadPath):
                 raise InputError(f"motion.poses, line {line}: the object is {wrong}; places are in mm")
 
 
-def turns_of(motion: Motion) -> FloatArray:
-    """(k, 3, 3) of the body's frame, in a motion by poses."""
-    return np.asarray(Rotation.from_quat(np.array(motion.poses)[:, 4:]).as_matrix())
+def poses_of(motion: Motion) -> tuple[FloatArray, FloatArray]:
+    """Places (k, 3) mm of the body's origin, and turns (k, 3, 3) of its frame, in a motion by poses."""
+    rows = np.array(motion.poses)
+    return rows[:, 1:4], np.asarray(Rotation.from_quat(rows[:, 4:]).as_matrix())
 
 
 def touchable_at(motion: Motion, size_mm: Vector3) -> Touchable:
     """The part of a body that comes near a gel, whose bounding box is of that size, at any of a motion's poses."""
     x, y, z = size_mm
     corners = np.array([[i * x / 2, j * y / 2, k] for i in (-1, 1) for j in (-1, 1) for k in (-z, z)])
-    away = corners - np.array(motion.poses)[:, None, 1:4]
-    every = (away @ turns_of(motion)).reshape(-1, 3)
+    places, turns = poses_of(motion)
+    every = ((corners - places[:, None]) @ turns).reshape(-1, 3)
     return Touchable(box=np.array([every.min(axis=0) - NEAR_MM, every.max(axis=0) + NEAR_MM]))

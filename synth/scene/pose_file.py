@@ -6,11 +6,8 @@ sensor's left-handed axes, as everywhere in a scene: (0, 0, sin(a/2), cos(a/2)) 
 becomes the scene's, so that a job depends on it and a dataset holds it.
 """
 
-import csv
-import io
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,42 +26,39 @@ FAR_MM = 1000.0
 
 def pose_problem(rows: Sequence[Sequence[float]]) -> tuple[int, str] | None:
     """The number of the first row that is no pose, or comes no later than the row before, and what is wrong with it."""
+    time = -math.inf
     for number, row in enumerate(rows):
-        length = math.hypot(*row[4:])
         if len(row) != len(HEADER) or not all(map(math.isfinite, row)):
             return number, f"a pose has {len(HEADER)} finite numbers: {', '.join(HEADER)}"
-        if abs(length - 1) > UNIT:
+        if abs((length := math.hypot(*row[4:])) - 1) > UNIT:
             return number, f"the quaternion {list(row[4:])} has length {length:.4g}; that of a rotation has 1"
         if max(map(abs, row[1:4])) > FAR_MM:
             return number, f"the place {list(row[1:4])} is farther than {FAR_MM:g} mm off; places are in mm"
-    for number, (before, row) in enumerate(pairwise(rows), 1):
-        if row[0] <= before[0]:
-            return number, f"time_s = {row[0]:g} does not come after {before[0]:g}, the time of the pose before"
+        if row[0] <= time:
+            return number, f"time_s = {row[0]:g} does not come after {time:g}, the time of the pose before"
+        time = row[0]
     return None if 2 <= len(rows) <= MOST_POSES else (len(rows), f"{len(rows)} poses; allowed are 2 to {MOST_POSES}")
 
 
 def read_poses(path: Path) -> list[list[float]]:
     """The rows of a file of poses; InputError, with the number of the line, for what is none."""
     try:
-        text = read_file(path, MOST_TEXT).decode("utf-8-sig").rstrip()
-        header, *lines = csv.reader(io.StringIO(text))
-    except OSError as error:
-        raise InputError(f"motion.poses: {path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, csv.Error) as error:
-        raise InputError(f"motion.poses: {path}: not a table of poses ({error})") from error
-    if [name.strip() for name in header] != list(HEADER):
-        raise InputError(
-            f"motion.poses: {path}, line 1: the header is {','.join(header)!r}; allowed is {','.join(HEADER)}"
-        )
-    rows = []
-    for number, line in enumerate(lines, 2):
-        try:
-            rows.append([float(cell) for cell in line])
-        except ValueError as error:
-            raise InputError(f"motion.poses: {path}, line {number}: {error}") from None
+        header, *lines = read_file(path, MOST_TEXT).decode("utf-8-sig").rstrip().split("\n")
+    except (OSError, ValueError) as error:
+        raise InputError(f"motion.poses: {path}: cannot be read: {error}") from error
+    if [name.strip() for name in header.split(",")] != list(HEADER):
+        raise InputError(f"motion.poses: {path}, line 1: the header is {header!r}; allowed is {','.join(HEADER)}")
+    rows = [[_number(cell) for cell in line.split(",")] for line in lines]
     if problem := pose_problem(rows):
         raise InputError(f"motion.poses: {path}, line {problem[0] + 2}: {problem[1]}")
     return rows
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
 
 
 def with_poses(value: Any, folder: Path) -> Any:

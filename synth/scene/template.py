@@ -154,9 +154,9 @@ def load_scene(name_or_path: str | Path, set: Sequence[str] = ()) -> Template:
 
 def checked_template(content: dict[str, Any], source: Path, changed: tuple[str, ...] = ()) -> Template:
     """A template whose distributions, corners and mesh files have been checked; InputError says what is wrong."""
-    template = Template(content, source, changed)
+    template = Template(with_poses(content, source.parent), source, changed)
     try:
-        template = replace(template, content=with_poses(measured(content, source.parent), source.parent))
+        template = replace(template, content=measured(template.content, source.parent))
     except ValueError as error:
         raise InputError(f"{template.label}: sensor.gel: {error}") from None
     for kind, arguments, where in template.distributions():

@@ -1,6 +1,7 @@
 """What a ball's contact tells of the lights."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,14 +10,15 @@ import pytest
 import tomli_w
 from commands import refused, said
 from render_scenes import FAST, needs_llvm, small_sensor
+from scipy.interpolate import LinearNDInterpolator
 
 from synth.arrays import FloatArray
 from synth.calibrate.ball_fit import Balls, find_presses
 from synth.calibrate.contact import change, find_contact, flanks
-from synth.calibrate.irradiance import LightGeometry, LitGel
+from synth.calibrate.irradiance import LightGeometry, LitGel, PressChange
 from synth.calibrate.layouts import around, chosen
-from synth.calibrate.lights import Room, Target
-from synth.calibrate.pressed_ball import press_ball
+from synth.calibrate.lights import Room, Target, fit_lights
+from synth.calibrate.pressed_ball import press_ball, press_series
 from synth.calibrate.sensor_fit import room_of
 from synth.cli import main
 from synth.render.camera_image import camera_image
@@ -89,6 +91,39 @@ def test_frames_that_the_ball_cannot_have_made_are_refused(changed: FloatArray, 
     rest, bare = np.full((120, 160, 3), 0.4), {"b.png": np.ones((120, 160), dtype=bool)}
     balls = Balls({"b.png": rest + changed}, radius, 0.5)
     assert refused(message, find_presses, _sensor(-90.0, 20.0, 140.0), balls, rest, bare).count("\n") == 0
+
+
+def test_a_series_has_the_faces_of_single_presses() -> None:
+    sensor, place, depth = _sensor(0.0, 120.0, 240.0), np.array([0.5, -0.4]), 0.53
+    series, ball = press_series(sensor, 3.0, 0.9, 0.5), press_ball(sensor, 3.0, depth, place, 0.5)
+    face = series.face(np.array([*place, np.log(depth)]))
+    near = np.linalg.norm(ball.positions[:, :2] - place, axis=1) < 2.5
+    height = LinearNDInterpolator(face[:, :2], face[:, 2])(ball.positions[near, :2])
+    # mm: both meshes are made for errors of 0.004, on either side, and largest where the gel leaves the ball
+    assert np.sqrt(np.mean((height - ball.positions[near, 2]) ** 2)) < 0.012
+    assert series.depth_mm(ball.contact_mm) == pytest.approx(depth, rel=0.25)  # vertices are 0.2 mm apart
+
+
+@needs_llvm
+def test_poses_are_found_together_with_the_lights() -> None:
+    """From poses as circles of contacts tell them, and the heights of lights half a millimetre off."""
+    sensor, series = _sensor(-90.0, 20.0, 140.0), press_series(_sensor(-90.0, 20.0, 140.0), 3.0, 0.9, 0.5)
+    truth, poses = LightGeometry.of(sensor.lights), np.array([[-1.5, -1.0, np.log(0.5)], [1.5, 1.0, np.log(0.4)]])
+    columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(4, 160, 8), np.arange(4, 120, 8)))
+    pixels = np.column_stack([columns, rows]) + 0.5
+    flat = LitGel(sensor, pixels, FAST)
+
+    def press(pose: FloatArray) -> PressChange:
+        return PressChange(LitGel(sensor, pixels, FAST, (series.surface, series.face(pose))), flat)
+
+    shown = np.concatenate([one.contributions(truth) for one in (flat, *map(press, poses))], axis=1)
+    signal = 300 * np.einsum("mpc,mc->pc", shown, np.eye(3))
+    target = Target(signal, np.ones_like(signal), 1.0, np.zeros(len(signal)))
+    start = replace(truth, centre=truth.centre + np.array([0.0, 0.0, 0.5]))
+    off = poses + np.array([[0.2, -0.2, 0.2], [-0.2, 0.1, -0.2]])
+    found = fit_lights(flat, target, start, np.eye(3, dtype=bool), 0.0, room_of(sensor), 12, (press, press), off)
+    assert np.abs(found.poses - poses).max() < 0.03  # the prior pulls: a tenth of where poses start
+    assert np.abs(found.geometry.centre - truth.centre).max() < 0.25
 
 
 def test_a_press_through_the_gel_is_refused() -> None:
@@ -179,6 +214,10 @@ def test_known_lights_are_found_from_three_frames_at_rest_and_three_presses(tmp_
         assert max(contact["rms_within"]) < 6  # levels: as between frames, the camera's noise is 2
         assert np.abs(np.subtract(*contact["azimuth_deg"].values())).max() < 5
     assert record["verdict"]["good"]
+    given[given.index("--radius-mm") + 1] = 6
+    command = ["calibrate", "--scene", tmp_path / "start.toml", *given, "--steps", 8, "--out", tmp_path / "wrong"]
+    assert main(list(map(str, command))) == 2
+    assert "--radius-mm = 6: a ball of 3.6 mm explains the frames far better" in capsys.readouterr().err
 
 
 def test_a_long_light_across_a_corner_of_the_view_is_in_it() -> None:

@@ -1,17 +1,19 @@
 """Measured light fitted to presses: known quadratic forms are recovered, and what is written is what was fitted."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from render_scenes import FAST, needs_llvm, small_sensor
 
 from synth.arrays import FloatArray
-from synth.calibrate.ball_fit import BallFit, Balls, Press
+from synth.calibrate.ball_fit import BallFit, Press
 from synth.calibrate.contact import Contact
 from synth.calibrate.frames import Frames
 from synth.calibrate.irradiance import LightGeometry, LitGel
 from synth.calibrate.lights import LightFit
 from synth.calibrate.measured import FILE, FLAT, fit_measured, written
+from synth.calibrate.pressed_ball import press_series
 from synth.calibrate.sensor_fit import SensorFit
 from synth.render.camera_image import off_centre
 from synth.render.measured_light import read_measured_light
@@ -36,7 +38,7 @@ def test_light_on_tilted_faces_is_recovered_from_presses(tmp_path: Path) -> None
         for c, a in enumerate(DIRECTIONS)
     )
     sensor = small_sensor(1.41, None, lights, vignetting=0.2, position_mm=(0, 0, 20), look_at_mm=(0, 0, 0), **CAMERA)
-    camera, balls, presses = sensor.camera, Balls({}, 3.0, 0.5), []
+    camera, presses, series = sensor.camera, [], press_series(sensor, 3.0, 1.0, 0.5)
     y, x = np.mgrid[:120, :160] + 0.5
     every = np.column_stack([x.ravel(), y.ravel()])
     flat = LitGel(sensor, every, FAST)
@@ -46,17 +48,24 @@ def test_light_on_tilted_faces_is_recovered_from_presses(tmp_path: Path) -> None
         return light * gel.visible(LightGeometry.of(lights)).T
 
     rest = shown(flat, every).reshape(120, 160, 3) ** (1 / 2.2)
-    for number, place in enumerate([(-2.0, -1.2), (2.0, 1.0), (1.8, -1.4), (-1.6, 1.5)]):
+    for number, place in enumerate([(-2.0, -1.2), (2.0, 1.0), (1.8, -1.4), (-1.6, 1.5), (0.0, 0.2)]):
         press = Press(
             f"b{number}", Contact((0, 0), 1), every[::29], np.zeros(0), np.zeros(0), np.array([*place, np.log(0.8)])
         )
-        ball = press.ball(sensor, balls)
-        gel = LitGel(sensor, press.pixels, FAST, (ball.surface, ball.positions))
+        gel = LitGel(sensor, press.pixels, FAST, (series.surface, series.face(press.pose)))
         before, after = 255 * rest.reshape(-1, 3)[::29], 255 * shown(gel, press.pixels) ** (1 / 2.2)
         presses.append(Press(press.name, press.contact, press.pixels, before, after - before, press.pose))
-    fit = LightFit(LightGeometry.of(lights), 300 * np.eye(3), 0.2, 0.0, 0)
-    whole = SensorFit(sensor, fit, None, None, np.ones((120, 160), bool), BallFit(fit, tuple(presses), ()))
-    lit, model = fit_measured(whole, Frames(rest, rest, 1 / 255), balls, FAST)
+    pose = presses[-1].pose
+    presses[-1] = replace(
+        presses[-1], pose=pose + np.array([0.2, -0.2, 0.2])
+    )  # as lights that are not measured would have it
+    fit = LightFit(LightGeometry.of(lights), 300 * np.eye(3), 0.2, 0.0, 0, np.zeros((0, 3)))
+    whole = SensorFit(sensor, fit, None, None, np.ones((120, 160), bool), BallFit(fit, tuple(presses), (), series))
+    lit, model = fit_measured(whole, Frames(rest, rest, 1 / 255), frozenset({"b4"}), FAST)
+    assert lit.pressed is not None
+    np.testing.assert_allclose(
+        lit.pressed.presses[-1].pose, pose, atol=0.05
+    )  # of the search, 0.01, and the light's 5 %
     # Each slope is shown at a few places only, between which the light changes by some 5 %.
     for polar, azimuth in np.radians(TILTS):
         normal = np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])

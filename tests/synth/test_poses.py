@@ -1,20 +1,26 @@
 """Poses from outside: as a press of the same motion, by symmetry, with objects, and what is refused."""
 
+import io
 import math
+import re
+from base64 import b64decode
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from commands import refused
+from commands import refused, said
 from pads import brick, capsule, capsule_mesh, complete, scene
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from tiny_scene import write_tiny
 
+from synth.cli import main
 from synth.dataset.export import export
 from synth.dataset.reader import read_dataset
 from synth.pipeline.generate import generate
 from synth.planning import plan, predict
+from synth.press.measure import Distance
 from synth.press.scene_path import path_of
 from synth.render.variant import Variant
 from synth.sampling import draw
@@ -74,6 +80,25 @@ def test_the_same_press_by_motion_and_by_poses_gives_the_same_states(indenter: d
     assert by_poses.states[3].force_n[2] > 0.1
 
 
+def test_an_offset_names_the_point_that_poses_are_of() -> None:
+    """Of a tilted box: the pose of its own centre is that of the point less what lies between."""
+    point, turn = np.array([0.3, -0.2, 0.5]), about("y", 12.0)
+    content = scene(indenter={**BOX, "offset_mm": point}).model_dump()
+    rows = [row(0, (0, 0, -2.0), turn), row(1, (0.1, 0, -1.0), turn)]
+    content["motion"] = {"poses": rows, "steps": 1}
+    moved = [(*one[:1], *(np.array(one[1:4]) - turn.apply(point)), *one[4:]) for one in rows]
+    own = {**content, "contact": scene(indenter=BOX).model_dump()["contact"], "motion": {"poses": moved, "steps": 1}}
+    one, two = (path_of(Scene.model_validate(given)) for given in (content, own))
+    places = np.random.default_rng(0).uniform(-2, 2, (50, 3))
+    for s in (0.0, one.length_mm):
+        distances = [
+            Distance(path.body, path.pose(s).centre[None], path.pose(s).rotation[None])(places, np.zeros(50, int))[1]
+            for path in (one, two)
+        ]
+        np.testing.assert_allclose(distances[0], distances[1], atol=1e-12)
+        assert one.pose(s).depth_mm == pytest.approx(two.pose(s).depth_mm, abs=1e-12)
+
+
 def mirrored(field: np.ndarray) -> np.ndarray:
     """A field of the brick, which is its own mirror image in x = 0, in that mirror."""
     points = MESH.points
@@ -127,10 +152,10 @@ REST = "0,0,0,-4,0,0,0,1\n"
     ("text", "message"),
     [
         ("t,x,y,z,qx,qy,qz,qw\n" + REST, r"line 1: the header is 't,x,y,z.*allowed is time_s,x_mm"),
-        ("", "not a table of poses"),
+        ("", "line 1: the header is .*allowed is time_s"),
         (HEAD + REST + "1,0,0,nan,0,0,0,1\n", "line 3: a pose has 8 finite numbers"),
         (HEAD + REST + "1,0,0,-3,0,0,1\n", "line 3: a pose has 8 finite numbers"),
-        (HEAD + REST + "1,0,0,abc,0,0,0,1\n", "line 3: could not convert"),
+        (HEAD + REST + "1,0,0,abc,0,0,0,1\n", "line 3: a pose has 8 finite numbers"),
         (HEAD + REST + "\n1,0,0,-3,0,0,0,1\n", "line 3: a pose has"),
         (HEAD + REST + "1,0,0,-3,0,0,0,1\n1,0,0,-2,0,0,0,1\n", "line 4: time_s = 1 does not come after 1"),
         (HEAD + REST + "1,0,0,-3,0,0,0,0.5\n", "line 3: the quaternion .* has length 0.5"),
@@ -180,6 +205,7 @@ def test_on_a_round_gel_a_press_by_poses_is_that_by_motion_and_must_not_begin_wi
 def test_poses_stand_alone_and_are_simulated_one_by_one(tmp_path: Path) -> None:
     (tmp_path / "grasp.csv").write_text(HEAD + REST + "1,0,0,-3.7,0,0,0,1\n")  # two states: one pair
     path, poses = write_tiny(tmp_path), f'"{tmp_path}/grasp.csv"'
+    refused(r"^motion\.poses: .*nofile\.csv: cannot be read", load_scene, path, ['motion={ poses = "nofile.csv" }'])
     refused("leave out depth_mm", lambda: load_scene(path, [f"motion.poses={poses}"]))
     refused("steps = 7: 2 poses have 1", lambda: load_scene(path, [f"motion={{ poses = {poses}, steps = 7 }}"]))
     refused("motion: depth_mm is missing; give it, or poses", lambda: load_scene(path, ["motion={ steps = 2 }"]))
@@ -201,7 +227,7 @@ GRASP = """time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw
 """
 
 
-def test_a_grasp_of_an_object_rolled_lifted_and_taken_again_is_a_clip(tmp_path: Path) -> None:
+def test_a_grasp_of_an_object_rolled_lifted_and_taken_again_is_a_clip(tmp_path: Path, capsys) -> None:
     """The object's frame is its file's, whose origin is 1 mm above its middle; the file is no longer needed then."""
     pyvista = pytest.importorskip("pyvista")
     block = pyvista.ParametricSuperEllipsoid(xradius=2.0, yradius=1.5, zradius=2.0, n1=0.5, n2=0.5)
@@ -229,6 +255,12 @@ def test_a_grasp_of_an_object_rolled_lifted_and_taken_again_is_a_clip(tmp_path: 
     assert abs(clip.states["ty_nmm"][4] - clip.states["ty_nmm"][3]) > 0.01
     # Lifted, the gel is at rest again, within the solver's tolerance.
     assert np.nanmax(np.abs(clip.flows[5].forward)) < 1e-3 * np.nanmax(np.abs(clip.flows[4].forward))
+    said(capsys, main, "inspect", tmp_path / "d", "--html", tmp_path / "page.html")
+    (film,) = re.findall(r"data:image/webp;base64,([^\"]+)", (tmp_path / "page.html").read_text())
+    played = Image.open(io.BytesIO(b64decode(film)))
+    played.load()
+    # Whole milliseconds: 8 frames that begin within 2 s.
+    assert played.info["duration"] == pytest.approx(2000 / 7, abs=1)
     h5py = pytest.importorskip("h5py")
     export(tmp_path / "d", "hdf5", tmp_path / "o")
     with h5py.File(tmp_path / "o" / "dataset.hdf5") as whole:
