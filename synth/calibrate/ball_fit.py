@@ -153,7 +153,7 @@ def fit_balls(
     )
     for known in (False, True):  # poses as the contacts' circles tell them, then as the best fit has them
         poses = best[0].poses if known else poses
-        gels = gel, *(one(pose) for one, pose in zip(at, poses, strict=True))
+        gels: list[LitGel | PressChange] = [gel, *(one(pose) for one, pose in zip(at, poses, strict=True))]
         layout = chosen(gels, whole, first.geometry, shines, first.vignetting, room)
         low = np.maximum(layout.centre - reach / 2, [-np.inf, -np.inf, room.low[:, 2].min()])
         high = np.minimum(layout.centre + reach / 2, [np.inf, np.inf, room.high[:, 2].max()])
