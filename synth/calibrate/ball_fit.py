@@ -65,9 +65,10 @@ class Press:
     changed: FloatArray
     pose: FloatArray
 
-    def ball(self, sensor: Sensor, balls: Balls) -> PressedBall:
-        """The gel's face under the ball at its place and depth."""
-        return press_ball(sensor, balls.radius_mm, float(np.exp(self.pose[2])), self.pose[:2], balls.friction)
+    def ball(self, sensor: Sensor, balls: Balls, series: BallSeries) -> PressedBall:
+        """The gel's face under the ball at its place and depth, at most that of the series that it was found by."""
+        depth = min(float(np.exp(self.pose[2])), float(series.contacts[-1, 0]))
+        return press_ball(sensor, balls.radius_mm, depth, self.pose[:2], balls.friction)
 
     def azimuth_and_rise(self, changed: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Those of `synth.calibrate.contact.flanks`, of a change (n, 3) at the pixels."""
@@ -153,7 +154,7 @@ def fit_balls(
     )
     for known in (False, True):  # poses as the contacts' circles tell them, then as the best fit has them
         poses = best[0].poses if known else poses
-        gels = gel, *(one(pose) for one, pose in zip(at, poses, strict=True))
+        gels: list[LitGel | PressChange] = [gel, *(one(pose) for one, pose in zip(at, poses, strict=True))]
         layout = chosen(gels, whole, first.geometry, shines, first.vignetting, room)
         low = np.maximum(layout.centre - reach / 2, [-np.inf, -np.inf, room.low[:, 2].min()])
         high = np.minimum(layout.centre + reach / 2, [np.inf, np.inf, room.high[:, 2].max()])

@@ -66,12 +66,12 @@ def fit_measured(
         leads = [tried[3 * best + channel] for channel, best in enumerate(np.argmin(missed, axis=0))]
         told, coefficients = _solved(told, partial(rows, lights=leads), gamma)
 
-    def model(press: Press) -> FloatArray:
+    def changed(press: Press) -> FloatArray:
         value = np.maximum(np.einsum("cnk,ck->nc", rows(press, leads), coefficients), 0)
         return np.asarray(255 * value ** (1 / gamma) - press.rest)
 
     at = {press.name: press for press in told}
-    presses = tuple(at.get(press.name) or placed(press, model) for press in fit.pressed.presses)
+    presses = tuple(at.get(press.name) or placed(press, changed) for press in fit.pressed.presses)
     lights = [light.model_copy(update={"power": 1.0, "color": tuple(np.eye(3)[c].tolist())})
               for c, light in enumerate(leads)]  # fmt: skip
     measured = MeasuredLight(file=FILE, flat_field=FLAT)
@@ -79,7 +79,7 @@ def fit_measured(
     model = LightModel(
         coefficients.reshape(3, _FORMS, -1), (float(side[0]), float(side[1])), _flat(sensor, frames, fit, side)
     )
-    return replace(fit, sensor=lit, pressed=BallFit(fit.lights, presses, tuple(map(model, presses)), series)), model
+    return replace(fit, sensor=lit, pressed=BallFit(fit.lights, presses, tuple(map(changed, presses)), series)), model
 
 
 def _solved(presses: list[Press], rows: Callable[[Press], FloatArray], gamma: float) -> tuple[list[Press], FloatArray]:

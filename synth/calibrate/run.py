@@ -137,7 +137,7 @@ def _contacts(
         for press, changed in zip(fit.pressed.presses, fit.pressed.fitted, strict=True):
             frame = balls.frames[press.name]
             bare = fit.bare & find_bare(fit.sensor, frame) & (press.contact.away(frame.shape) < 1)
-            row = compare(frame, show(press.ball(fit.sensor, balls)), bare, fit.sensor)
+            row = compare(frame, show(press.ball(fit.sensor, balls, fit.pressed.series)), bare, fit.sensor)
             contacts.append(contact_numbers(press, changed, row))
             shown[contact_line(contacts[-1]).replace(": ", "\n").replace("; ", "\n")] = row
     return shown, contacts

@@ -34,7 +34,7 @@ _VIEW_MM = 0.3
 """Lights stay so far outside the camera's view."""
 _PUSH_MM, _LONGEST_PUSH = 0.25, 40
 """Length of a step by which a light in the view is moved outward, and most such steps."""
-_DOUBTED, _SMALLER, _BETTER, _CHECKING = 3 / 255, 0.6, 0.7, 6
+_DOUBTED, _SMALLER, _BETTER, _CHECKING = 2 / 255, 0.6, 0.7, 6
 """Residual beyond which the ball's radius is doubted, share of it that is tried, share of the residual by which that
 one is better, and steps of its fit."""
 _DARKEST, _BRIGHTEST = 2 / 255, 253 / 255

@@ -53,8 +53,8 @@ def test_each_camera_has_its_files_and_is_read_and_exported_by_its_name(dataset,
     files = tmp_path / "left" / "data"
     assert np.frombuffer((files / "000000_flow.flo").read_bytes()[4:12], "<i4").tolist() == [40, 30]
     np.testing.assert_array_equal(cv2.imread(str(files / "000000_img2.ppm"))[..., ::-1], left.image2)
-    assert left_out(dataset).endswith(", pairs of left")
-    assert left_out(dataset, "left").endswith(", pairs of the main camera")
+    assert left_out(dataset, "", "flo").endswith(", pairs of left")
+    assert left_out(dataset, "left", "flo").endswith(", pairs of the main camera")
 
 
 def test_verify_checks_every_camera(dataset, tmp_path):
