@@ -9,9 +9,10 @@ import pytest
 import pyvista as pv
 import warp as wp
 from commands import refused
-from pads import ELEMENT, MIXED, PUNCH, SPHERE, brick, dense, indenters, presses_of, same, scene, simulate_scenes
+from pads import ELEMENT, MIXED, PUNCH, SPHERE, brick, dense, indenters, same, scene, simulate_scenes
 
 from synth.mesh import PadMesh
+from synth.press.press import Press
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.batched import simulate_presses
@@ -190,11 +191,9 @@ def test_scenes_must_share_the_pad_which_serves_several_runs() -> None:
     soft, stiffening, short = {"poisson_ratio": 0.45}, {"stiffening": [0.1, 0.0]}, {"max_step_mm": 0.05}
     for other in (scene(gel=soft), scene(gel=stiffening), scene(numerics=short)):
         refused("must share the gel's materials and all numerics", simulate_scenes, [scene(), other], MESH)
-        refused("must share", list, simulate_presses(presses_of([other], MESH), pad))
-    with pytest.raises(ValueError, match="1 sets of frames for 2 presses"):
-        simulate_scenes([scene(), scene()], MESH, frames=[frozenset({1})])
+        refused("must share", list, simulate_presses([(Press.of(other, MESH), None)], pad))
     posed = scene(friction=0.4, motion={"depth_mm": 0.2})
-    pad, presses = prepare(posed, MESH, "cpu"), presses_of([posed], MESH)
+    pad, presses = prepare(posed, MESH, "cpu"), [(Press.of(posed, MESH), None)]
     (_, one), (_, other) = (next(simulate_presses(presses, pad)) for _ in range(2))
     assert same(one, other)
     assert list(simulate_presses([], pad)) == []

@@ -15,7 +15,6 @@ from pads import (
     found_by_newton,
     gentle,
     indenters,
-    presses_of,
     same,
     scene,
     simulate_scenes,
@@ -261,7 +260,8 @@ def test_the_path_does_not_depend_on_which_states_are_corrected() -> None:
 def test_a_state_without_balance_to_the_full_tolerance_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is to be recorded never converges: back to where the step began."""
     posed = dragged(5000.0, depth_mm=0.2, steps=1)
-    run = Run(presses_of([posed], MESH), prepare(posed, MESH, "cpu"), None, 1, SolverOptions(relaxed_tolerance=0.3))
+    pressed = (0, (Press.of(posed, MESH), None))
+    run = Run([pressed], iter([]), prepare(posed, MESH, "cpu"), SolverOptions(relaxed_tolerance=0.3))
     arrays = run.solver._arrays
     fields, contact = arrays.fields, arrays.contact
 

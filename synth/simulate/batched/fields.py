@@ -39,10 +39,10 @@ class Fields:
 
 
 @wp.kernel
-def clear_fields(assignment: wp.array(dtype=wp.int32), fields: Fields):
+def clear_fields(mask: wp.array(dtype=wp.int32), fields: Fields):
     """One thread per (lane, node and then pressure): the undeformed state in fresh lanes."""
     s, i = wp.tid()
-    if assignment[s] < 0:
+    if mask[s] == 0:
         return
     count = fields.state_u.shape[1]
     if i < count:
@@ -205,10 +205,10 @@ def to_start(orders: wp.array(dtype=wp.int32), numbers: wp.array2d(dtype=wp.floa
 
 
 @wp.kernel
-def clear_contact(assignment: wp.array(dtype=wp.int32), contact: ContactState):
+def clear_contact(mask: wp.array(dtype=wp.int32), contact: ContactState):
     """One thread per (lane, face, point): nothing touched before in a fresh lane, not even what touches at once."""
     s, f, q = wp.tid()
-    if assignment[s] < 0:
+    if mask[s] == 0:
         return
     contact.normal[s, f, q] = wp.float64(0.0)
     contact.tangent[s, f, q] = wp.vec3d()

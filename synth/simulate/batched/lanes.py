@@ -9,7 +9,6 @@ from enum import IntEnum, IntFlag
 
 import warp as wp
 
-from synth.press.distance import shape_vector
 from synth.simulate.contact import Indenters
 from synth.simulate.policy import requests
 
@@ -55,14 +54,14 @@ EVALUATED = wp.constant(int(Order.EVALUATE | Order.TRY))
 
 @wp.struct
 class Presses:
-    """Every press's load path and body, (N, ...).
+    """The load path and body of each lane's press, (B, ...).
 
     Attributes:
-        corners, ends, legs: `LoadPath.corners` (N, K, 4), `LoadPath.ends` (N, K) and their number.
+        corners, ends, legs: `LoadPath.corners` (B, K, 4), `LoadPath.ends` (B, K) and their number, 0 before
+            the lane's first press.
         origin, axes: of `LoadPath.frame`; zeros and the identity for flat pads and domes.
         position, rotation: of the body, as `LoadPath.pose` uses them; reach: the body's less the face's z, mm.
-        kind, shape, friction: as `synth.simulate.contact.Indenters`; sharpness: times the contact stiffness, E per mm.
-        grid, grids: number of its distance grid among the different ones (g, cells).
+        friction: as `synth.simulate.contact.Indenters`; sharpness: times the contact stiffness, E per mm.
     """
 
     corners: wp.array2d(dtype=wp.vec4d)
@@ -73,10 +72,6 @@ class Presses:
     position: wp.array(dtype=wp.vec2d)
     reach: wp.array(dtype=wp.float64)
     rotation: wp.array(dtype=wp.mat33d)
-    kind: wp.array(dtype=wp.int32)
-    shape: wp.array(dtype=shape_vector)
-    grid: wp.array(dtype=wp.int32)
-    grids: wp.array2d(dtype=wp.float64)
     friction: wp.array(dtype=wp.float64)
     sharpness: wp.array(dtype=wp.float64)
 
@@ -131,18 +126,14 @@ def _corner(presses: Presses, j: int, s: wp.float64) -> wp.vec4d:
 
 
 @wp.kernel
-def set_stiffness(
-    press: wp.array(dtype=wp.int32), numbers: wp.array2d(dtype=wp.float64), presses: Presses, indenters: Indenters
-):
+def set_stiffness(numbers: wp.array2d(dtype=wp.float64), presses: Presses, indenters: Indenters):
     """The contact stiffness, so many times the body's own."""
     s = wp.tid()
-    if press[s] >= 0:
-        indenters.sharpness[s] = numbers[s, STIFFENING] * presses.sharpness[press[s]]
+    indenters.sharpness[s] = numbers[s, STIFFENING] * presses.sharpness[s]
 
 
 @wp.kernel
 def place_indenters(
-    press: wp.array(dtype=wp.int32),
     orders: wp.array(dtype=wp.int32),
     numbers: wp.array2d(dtype=wp.float64),
     presses: Presses,
@@ -150,47 +141,18 @@ def place_indenters(
 ):
     """Each lane's indenter where it is to be, and its friction."""
     i = wp.tid()
-    j = press[i]
-    if j < 0:
+    if presses.legs[i] == 0:
         return
-    pose = _corner(presses, j, numbers[i, AT])
-    place = presses.position[j]
-    local = wp.vec3d(place[0] + pose[1], place[1] + pose[2], pose[0] - presses.reach[j])
-    indenters.centre[i] = presses.origin[j] + presses.axes[j] * local
+    pose = _corner(presses, i, numbers[i, AT])
+    place = presses.position[i]
+    local = wp.vec3d(place[0] + pose[1], place[1] + pose[2], pose[0] - presses.reach[i])
+    indenters.centre[i] = presses.origin[i] + presses.axes[i] * local
     zero = wp.float64(0.0)
     angle = pose[3] * (wp.float64(3.14159265358979323846) / wp.float64(180.0))
     c = wp.cos(angle)
     n = wp.sin(angle)
     turn = wp.mat33d(c, -n, zero, n, c, zero, zero, zero, wp.float64(1.0))
-    indenters.rotation[i] = presses.axes[j] * (turn * presses.rotation[j])
-    indenters.friction[i] = presses.friction[j]
+    indenters.rotation[i] = presses.axes[i] * (turn * presses.rotation[i])
+    indenters.friction[i] = presses.friction[i]
     if (orders[i] & STICKING) != 0:
         indenters.friction[i] = STICK_FRICTION
-
-
-@wp.kernel
-def fill_lanes(
-    assignment: wp.array(dtype=wp.int32), presses: Presses, press: wp.array(dtype=wp.int32), indenters: Indenters
-):
-    """A new press in each lane that is assigned one (-1: none; -2: none, and the lane is empty)."""
-    s = wp.tid()
-    j = assignment[s]
-    if j == -2:
-        press[s] = -1
-    if j < 0:
-        return
-    press[s] = j
-    indenters.kind[s] = presses.kind[j]
-    indenters.shape[s] = presses.shape[j]
-
-
-@wp.kernel
-def copy_grids(assignment: wp.array(dtype=wp.int32), presses: Presses, indenters: Indenters):
-    """One thread per (lane, cell): the distance grids of mesh indenters that begin."""
-    s, i = wp.tid()
-    j = assignment[s]
-    if j < 0:
-        return
-    y = indenters.coefficients.shape[2]
-    z = indenters.coefficients.shape[3]
-    indenters.coefficients[s, i // (y * z), (i // z) % y, i % z] = presses.grids[presses.grid[j], i]

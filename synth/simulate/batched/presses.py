@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from synth.arrays import FloatArray
+from synth.press.distance import SHAPE_LENGTH
 from synth.press.press import Press
 from synth.simulate.batched.lanes import Presses
 from synth.simulate.batched.reductions import SCALARS
@@ -14,46 +15,55 @@ from synth.simulate.tables import struct_of
 from synth.simulate.trajectory import State, Trajectory, at_rest
 
 
-def press_tables(presses: Sequence[Press], d: str) -> tuple[Presses, tuple[int, int, int]]:
-    """All presses, of one pad, on Warp device d, and the counts of their largest distance grid."""
-    paths = [press.path for press in presses]
-    bodies = [path.body for path in paths]
-    grids = {_grid_key(body.coefficients): body.coefficients for body in bodies}
-    numbers = {key: number for number, key in enumerate(grids)}
-    counts = tuple(int(n) for n in np.max([grid.shape for grid in grids.values()], axis=0))
-    padded = np.zeros((len(grids), *counts))
-    for room, grid in zip(padded, grids.values(), strict=True):
-        room[tuple(slice(0, n) for n in grid.shape)] = grid
-    columns = {
-        "corners": _stacked([path.corners for path in paths]),
-        "ends": _stacked([path.ends for path in paths]),
-        "legs": [len(path.ends) for path in paths],
-        "origin": [np.zeros(3) if path.frame is None else path.frame.origin for path in paths],
-        "axes": [np.eye(3) if path.frame is None else path.frame.axes for path in paths],
-        "position": [path.motion.position_mm for path in paths],
-        "reach": [path.body.reach_mm - path.face_mm for path in paths],
-        "rotation": [body.rotation for body in bodies],
-        "kind": [body.kind for body in bodies],
-        "shape": [body.shape for body in bodies],
-        "grid": [numbers[_grid_key(body.coefficients)] for body in bodies],
-        "grids": padded.reshape(len(grids), -1),
-        "friction": [press.scene.contact.friction for press in presses],
-        "sharpness": [press.scene.numerics.penalty * press.path.body.sharpness for press in presses],
-    }
-    return struct_of(Presses, d, **columns), (counts[0], counts[1], counts[2])
+class PressTable:
+    """The presses in the lanes, by columns; row s is lane s's.
+
+    `kind` (B,) and `shape` (B, k) are of the bodies, see `synth.simulate.contact.Indenters`.
+    """
+
+    def __init__(self, batch: int, device: str) -> None:
+        self._device = device
+        self.kind, self.shape = np.zeros(batch, dtype=np.int32), np.zeros((batch, SHAPE_LENGTH))
+        widths: dict[str, tuple[int, ...]] = {
+            "corners": (1, 4), "ends": (1,), "origin": (3,), "axes": (3, 3), "position": (2,), "reach": (),
+            "rotation": (3, 3), "friction": (), "sharpness": (),
+        }  # fmt: skip
+        self._columns: dict[str, np.ndarray] = {name: np.zeros((batch, *width)) for name, width in widths.items()}
+        self._columns["legs"] = np.zeros(batch, dtype=np.int32)
+
+    def put(self, lane: int, press: Press) -> None:
+        """A press begins in a lane."""
+        columns, path = self._columns, press.path
+        body, legs = path.body, len(path.ends)
+        self.kind[lane], self.shape[lane] = body.kind, body.shape
+        for name, values in (("corners", path.corners), ("ends", path.ends)):
+            column = columns[name]
+            if column.shape[1] < len(values):
+                columns[name] = column = padded(column, (len(column), len(values), *column.shape[2:]))
+            column[lane, : len(values)] = values
+        row = {
+            "legs": legs,
+            "origin": np.zeros(3) if path.frame is None else path.frame.origin,
+            "axes": np.eye(3) if path.frame is None else path.frame.axes,
+            "position": path.motion.position_mm,
+            "reach": body.reach_mm - path.face_mm,
+            "rotation": body.rotation,
+            "friction": press.scene.contact.friction,
+            "sharpness": press.scene.numerics.penalty * body.sharpness,
+        }
+        for name, value in row.items():
+            columns[name][lane] = value
+
+    def on_device(self) -> Presses:
+        """A copy for kernels."""
+        return struct_of(Presses, self._device, **self._columns)
 
 
-def _grid_key(grid: FloatArray) -> tuple[bytes, tuple[int, ...]]:
-    return grid.tobytes(), grid.shape
-
-
-def _stacked(arrays: Sequence[np.ndarray]) -> np.ndarray:
-    """Arrays of unequal lengths, filled up with zeros."""
-    longest = max(len(array) for array in arrays)
-    stacked = np.zeros((len(arrays), longest, *arrays[0].shape[1:]), dtype=arrays[0].dtype)
-    for row, array in zip(stacked, arrays, strict=True):
-        row[: len(array)] = array
-    return stacked
+def padded(array: np.ndarray, shape: Sequence[int]) -> np.ndarray:
+    """Zeros behind the numbers of an array."""
+    whole = np.zeros(shape, dtype=array.dtype)
+    whole[tuple(slice(0, n) for n in array.shape)] = array
+    return whole
 
 
 def trajectory(

@@ -172,7 +172,6 @@ def contact_forces(
 @wp.kernel
 def press_forces(
     mask: wp.array(dtype=wp.int32),
-    press: wp.array(dtype=wp.int32),
     axes: wp.array(dtype=wp.mat33d),
     sums: wp.array2d(dtype=wp.float64),
     seen: wp.array2d(dtype=wp.float64),
@@ -180,7 +179,7 @@ def press_forces(
     """The indenter's force along the press."""
     s = wp.tid()
     if mask[s] == 1:
-        a = axes[press[s]]
+        a = axes[s]
         seen[s, FORCE] = sums[s, 0] * a[0, 2] + sums[s, 1] * a[1, 2] + sums[s, 2] * a[2, 2]
 
 

@@ -11,18 +11,20 @@ a Newton iterate change from run to run even for the same batch; what converges 
 another equilibrium (docs/reports/batched_fem.md, Rounding).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from synth.arrays import FloatArray
+from synth.press.press import Press
 from synth.simulate.batched import fields, lanes, reductions
 from synth.simulate.batched import krylov as gmres
 from synth.simulate.batched.arrays import BatchArrays, number_rows
 from synth.simulate.batched.lanes import PATH_DERIVATIVE_STEP, Order
 from synth.simulate.batched.pad import Pad
+from synth.simulate.batched.presses import PressTable, padded
 from synth.simulate.batched.product import (
     BLOCK,
     barrier_product,
@@ -52,20 +54,13 @@ class BatchedSolver:
     `inner` are the Krylov iterations of a cycle.
     """
 
-    def __init__(
-        self,
-        pad: Pad,
-        presses: lanes.Presses,
-        batch: int,
-        records: int,
-        grid: tuple[int, int, int],
-        inner: int,
-    ) -> None:
+    def __init__(self, pad: Pad, batch: int, records: int, grid: tuple[int, int, int], inner: int) -> None:
         space, material, device = pad.space, pad.material, pad.device
         self.pad, self.batch, self.device = pad, batch, device
         rows = pad.preconditioner.rows
         self._bulk, self._faces = bulk_tables(space, material, pad.mixed, device), face_tables(space, device)
-        self.inner, self._presses = inner, presses
+        self.inner, self._table = inner, PressTable(batch, device)
+        self._presses = self._table.on_device()
         self._barrier = barrier_tables(space, material, device)
         self._rows = number_rows(space, pad.free, rows, self._bulk, device)
         surface = nodal_weights(space, self._faces.weight.numpy())
@@ -78,21 +73,26 @@ class BatchedSolver:
         self.krylov = self._arrays.krylov
         self._element_dim, self._face_dim = (batch, len(space.nodes)), self._arrays.points[:2]
         self._value_dim = (batch, len(space.points) + self._arrays.volume.shape[1])
-        self.watch: Callable[[str, str], None] = lambda part, kernel: None
+        self.watch: Callable[[str, str], None] | None = None
         """Called after each launch with the part of the cycle and the kernel's name, for profiles."""
         self._part = ""
+        self._is_warm, self._graph = False, None
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], *arguments: Any, block: int = 256) -> None:
         wp.launch(kernel, dim, inputs=list(arguments), device=self.device, block_dim=block)
-        self.watch(self._part, kernel.key)
+        self._tell(kernel.key)
 
     def _launch_blocks(self, kernel: wp.Kernel, block: int, *arguments: Any) -> None:
         """One block of so many threads per lane."""
         wp.launch_tiled(kernel, dim=[self.batch], inputs=list(arguments), block_dim=block, device=self.device)
-        self.watch(self._part, kernel.key)
+        self._tell(kernel.key)
 
-    def cycle(self, orders: np.ndarray, numbers: FloatArray) -> FloatArray:
-        """Do what all lanes are told; (B, k) what they have seen, by the columns of `lanes.Seen`.
+    def _tell(self, kernel: str) -> None:
+        if self.watch is not None:
+            self.watch(self._part, kernel)
+
+    def begin_cycle(self, orders: np.ndarray, numbers: FloatArray) -> None:
+        """Do what all lanes are told; on CUDA queue it.
 
         orders: (B,) sets of `lanes.Order`; numbers: (B, k) by the columns of `lanes.Number`.
         """
@@ -103,16 +103,38 @@ class BatchedSolver:
         self._end_solves()
         self._begin_steps()
         self._launch(lanes.viscosities, self.batch, a.numbers, a.viscosity)
-        self._launch(lanes.place_indenters, self.batch, a.press, a.orders, a.numbers, self._presses, a.indenters)
-        if self._told(Order.SOLVE):
-            self._linearise()
+        self._launch(lanes.place_indenters, self.batch, a.orders, a.numbers, self._presses, a.indenters)
+        self._solve_and_evaluate()
+
+    def seen(self) -> FloatArray:
+        """Wait for the end of the cycle; (B, k) what the lanes have seen, by the columns of `lanes.Seen`."""
+        return np.asarray(self._arrays.seen.numpy())
+
+    def _solve_and_evaluate(self) -> None:
+        """What every cycle does; on CUDA a graph that is captured the second time, when all kernels are loaded."""
+        device = wp.get_device(self.device)
+        if not device.is_cuda or not self._is_warm or self.watch is not None:
+            self._launch_all()
+            self._is_warm = True
+            return
+        if self._graph is None:
+            # Relaxed: the garbage collector may free a renderer's memory in this thread meanwhile.
+            mode = wp.CaptureMode.RELAXED
+            with wp.ScopedCapture(device=device, force_module_load=False, capture_mode=mode) as capture:
+                self._launch_all()
+            self._graph = capture.graph
+        wp.capture_launch(self._graph)
+
+    def _launch_all(self) -> None:
+        a = self._arrays
+        self._launch(lanes.select, self.batch, a.orders, int(Order.SOLVE), a.mask)
+        self._linearise()
         for _ in range(self.inner):
             self._iterate()
         self._part = "krylov"
         self._launch_blocks(self._solution, self._block, a.krylov, a.seen)
         self._launch(gmres.release, self.batch, a.krylov, a.orders, a.found)
         self._evaluate()
-        return np.asarray(a.seen.numpy())
 
     def _told(self, *orders: Order) -> bool:
         """Whether any lane is told any of these; which ones is then the mask."""
@@ -140,7 +162,7 @@ class BatchedSolver:
             self._launch(reductions.clear_sums, a.sums.shape, a.mask, a.sums)
             found = (a.fields.iterate_u, self._faces, a.indenters, a.traction, a.tangential)
             self._launch(reductions.contact_forces, self._face_dim, a.mask, *found, a.sums)
-            self._launch(reductions.press_forces, self.batch, a.mask, a.press, self._presses.axes, a.sums, a.seen)
+            self._launch(reductions.press_forces, self.batch, a.mask, self._presses.axes, a.sums, a.seen)
         if self._told(Order.RECORD):
             u, surface = a.fields.iterate_u, len(self.pad.space.surface_nodes)
             self._launch(reductions.write_record, u.shape, a.mask, a.numbers, u, a.sums, surface, a.records)
@@ -152,8 +174,7 @@ class BatchedSolver:
         a = self._arrays
         if self._told(Order.RESTORE_STEP):
             self._launch(fields.copy_memory, a.points, a.mask, a.saved, a.memory)
-        before = (a.press, a.numbers, self._presses, a.indenters)
-        self._launch(lanes.set_stiffness, self.batch, *before)
+        self._launch(lanes.set_stiffness, self.batch, a.numbers, self._presses, a.indenters)
         if self._told(Order.RESTORE_STEP, Order.ACCEPT, Order.BEGIN):
             self._launch(fields.to_start, self._value_dim, a.orders, a.numbers, a.fields)
         if self._told(Order.ACCEPT):
@@ -209,12 +230,12 @@ class BatchedSolver:
         a, k, elements, preconditioner = self._arrays, self.krylov, self._element_dim[::-1], self.pad.preconditioner
         self._part = "preconditioner"
         preconditioner.apply(k)
-        self.watch(self._part, "product with the inverse")
+        self._tell("product with the inverse")
         self._part = "product"
         preconditioner.dense.transpose(gmres.flat(k.preconditioned), k.corrected)
-        self.watch(self._part, "transpose")
+        self._tell("transpose")
         k.image.zero_()
-        self.watch(self._part, "zeros")
+        self._tell("zeros")
         found = (a.stored, k.corrected, k.image)
         self._launch(self._product, elements, k.running, self._rows.single, *found, block=BLOCK)
         if self._barrier is not None:
@@ -223,20 +244,24 @@ class BatchedSolver:
         contact = (a.touched, self._rows.face_row, self._rows.face_shape, a.stored_contact)
         self._launch(self._contact_product, self._face_dim, k.running, *contact, k.corrected, k.image)
         preconditioner.dense.transpose(k.image, gmres.flat(k.product))
-        self.watch(self._part, "transpose")
+        self._tell("transpose")
         self._part = "krylov"
         self._launch_blocks(self._arnoldi, self._block, k)
 
-    def fill(self, assignment: np.ndarray) -> None:
-        """Begin presses. assignment: (B,) number of the press, -1: go on, -2: leave empty."""
-        a, presses = self._arrays, self._presses
-        a.assignment.assign(assignment.astype(np.int32))
-        self._launch(lanes.fill_lanes, self.batch, a.assignment, presses, a.press, a.indenters)
-        if presses.grids.shape[1] > 1:
-            dim = (self.batch, presses.grids.shape[1])
-            self._launch(lanes.copy_grids, dim, a.assignment, presses, a.indenters)
-        self._launch(fields.clear_fields, self._value_dim, a.assignment, a.fields)
-        self._launch(fields.clear_contact, a.points, a.assignment, a.contact)
+    def fill(self, presses: Mapping[int, Press]) -> None:
+        """Begin presses, by lane."""
+        a, indenters, fresh = self._arrays, self._arrays.indenters, np.zeros(self.batch, dtype=np.int32)
+        for s, press in presses.items():
+            self._table.put(s, press)
+            fresh[s] = 1
+            if indenters.coefficients.size > self.batch:
+                indenters.coefficients[s].assign(padded(press.path.body.coefficients, indenters.coefficients.shape[1:]))
+        self._presses = self._table.on_device()
+        indenters.kind.assign(self._table.kind)
+        indenters.shape.assign(self._table.shape)
+        a.mask.assign(fresh)
+        self._launch(fields.clear_fields, self._value_dim, a.mask, a.fields)
+        self._launch(fields.clear_contact, a.points, a.mask, a.contact)
 
     def recorded(self, lane: int, count: int) -> FloatArray:
         """The first states that a lane has recorded, a copy: its next press writes into the same memory."""
