@@ -110,8 +110,8 @@ def together(drawn: Sequence[Drawn], pad: Pad, options: SolverOptions) -> list[T
             found[n] = str(error)
             continue
         which.append(n)
-    frames = [drawn[n].frames for n in which]
-    for k, trajectory in simulate_presses(presses, pad, frames, LARGEST_BATCH, options):
+    asked = [(press, drawn[n].frames) for n, press in zip(which, presses, strict=True)]
+    for k, trajectory in simulate_presses(asked, pad, LARGEST_BATCH, options):
         found[which[k]] = trajectory
     return [found[n] for n in range(len(drawn))]
 

@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
-from itertools import cycle, pairwise
+from itertools import cycle, islice, pairwise
 from typing import Any
 
 import numpy as np
@@ -82,11 +82,9 @@ def rate(case: Row, device: str) -> Row:
     rng = np.random.default_rng(0)
     scenes = [random_ball(rng, case) for _ in range(max(DRAWS, case["batch"]))]
     options = replace(OPTIONS, forcing=case["forcing"], relaxed_tolerance=case["relaxed"], closer=case["closer"])
-    order = cycle(range(len(scenes)))
-    presses = [Press.of(scene, pad.space.mesh) for scene in scenes]
-    run = Run(presses, pad, None, case["batch"], options, order, case["inner"])
-    for _ in range(2):  # with all lanes empty: compiles the kernels and captures the graph
-        run.advance()
+    presses = enumerate(cycle([(Press.of(scene, pad.space.mesh), None) for scene in scenes]))
+    next(iter(Run(list(islice(presses, 1)), iter([]), pad, options)))  # compiles the kernels
+    run = Run(list(islice(presses, case["batch"])), presses, pad, options, case["inner"])
     began = time.perf_counter()
     ends: list[float] = []
     complete = iterations = 0
@@ -123,8 +121,8 @@ def profile(run: Run, device: str) -> Row:
         before = np.where(krylov.running.numpy() == RUNNING, krylov.k.numpy(), 0)
         clock.start()
         run.solver.watch = clock.mark
-        run.solver.cycle()
-        run.solver.watch = lambda part, kernel: None
+        run.advance()
+        run.solver.watch = None
         for part, ms in clock.stop():
             parts[part] = parts.get(part, 0.0) + ms / PROFILED_CYCLES
         used += int(np.where(krylov.running.numpy() != WAITING, krylov.k.numpy() - before, 0).sum())

@@ -87,7 +87,7 @@ def together(case: Row, workers: int) -> list[Row]:
         for _, group in groupby(pressed, lambda each: pad_key(each[1])):
             numbers, presses, frames = zip(*group, strict=True)
             pad = prepare(presses[0].scene, presses[0].mesh, case["device"])
-            for k, result in simulate_presses(presses, pad, frames, BATCH["cuda"]):
+            for k, result in simulate_presses(zip(presses, frames, strict=True), pad, BATCH["cuda"]):
                 rows[numbers[k]] = found(result, frames[k], rounder)
         built = [each for each in built if rows[each[0]]["status"] != "complete"]
     return [{"trajectory": number, **rows[number]} for number in range(case["draws"])]

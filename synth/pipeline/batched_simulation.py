@@ -1,16 +1,17 @@
 """Trajectories simulated many at once.
 
-Tasks are taken some chunks ahead, drawn, sorted by their pads, and run through the lanes of `synth.simulate.batched`;
-an instance that fails is followed by its trajectory's next one in the next chunk. What a trajectory comes out as does
-not depend on which others ran beside it.
+Tasks are drawn as the lanes of `synth.simulate.batched` ask for presses, and sorted by their pads; an instance that
+fails is followed by its trajectory's next one. What a trajectory comes out as does not depend on which others ran
+beside it.
 
 The trajectories of one sensor are handed on together: its renderer is worth as much as some ten frames. Those that wait
 for one of their sensor's are a few hundred kilobytes each.
 """
 
-from collections import Counter
-from collections.abc import Iterable, Iterator
-from itertools import islice
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from itertools import count, islice
 
 import warp as wp
 
@@ -22,17 +23,18 @@ from synth.scene import Gel
 from synth.scene.template import Template
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import Pad, prepare
+from synth.simulate.batched.run import Asked
 
 BATCH = {"cuda": 256, "cpu": 8}
 """Trajectories at once."""
-CHUNK = 4
-"""Batches in a chunk of tasks that are drawn together: lanes are left empty at its end alone. The first
-chunk is one batch, because nothing can be rendered before it has been drawn."""
+MOST_DRAWN = 4
+"""Batches of presses that wait for another pad, at most, before lanes are left empty."""
 MIN_PER_SENSOR = 16
 """Waiting trajectories of a sensor that are worth building its renderer for; a clip alone is."""
 
 Result = SimulatedTrajectory | Outcome
 """A simulated trajectory, or the record of one whose every instance failed."""
+Drawn = tuple[Attempts, Attempt]
 
 
 class Pads:
@@ -74,45 +76,84 @@ class _Simulation:
         self._context, self._tasks, self._batch = context, tasks, batch
         self._pads = Pads(context)
         self._sensor: tuple[int, SensorInstance] | None = None
+        self._again: list[Attempts] = []
+        self._given_up: list[Attempts] = []
+        self._drawn: dict[Gel, deque[Drawn]] = {}
         self.open: Counter[int] = Counter()
 
     def __iter__(self) -> Iterator[tuple[int, Result]]:
         if self._context.plan.solver_device == "cuda":  # on a new machine several modules compile at once
             wp.load_module("synth.simulate", "cuda", recursive=True)
-        again: list[Attempts] = []
-        most = self._batch
-        while chunk := [*again, *self._begun(most - len(again))]:
-            again, most = [], CHUNK * self._batch
-            ready: dict[Gel, list[tuple[Attempts, Attempt]]] = {}
-            for attempts in chunk:
-                attempt = attempts.next(retry=False)
-                if attempt is not None:
-                    ready.setdefault(pad_key(attempt.press), []).append((attempts, attempt))
-                elif attempts.is_exhausted:
-                    yield attempts.trajectory, attempts.given_up()
-                else:
-                    again.append(attempts)
-            while ready:
-                members = ready.pop(next(iter(ready)))
-                presses, frames = zip(*((attempt.press, attempt.frames) for _, attempt in members), strict=True)
-                for number, result in simulate_presses(presses, self._pads.of(presses[0]), frames, self._batch):
-                    attempts, attempt = members[number]
+        while self._drawn or self._draw():
+            for gel in islice(self._drawn, 1):
+                presses = _OfOnePad(partial(self._next, gel))
+                pad = self._pads.of(self._drawn[gel][0][1].press)
+                for number, result in simulate_presses(presses, pad, self._batch):
+                    attempts, attempt = presses.under_way.pop(number)
                     simulated = attempts.simulated(attempt, result)
                     if simulated is None:
-                        again.append(attempts)
+                        self._again.append(attempts)
                     else:
                         yield attempts.trajectory, simulated
+            while self._given_up:
+                attempts = self._given_up.pop()
+                yield attempts.trajectory, attempts.given_up()
 
-    def _begun(self, most: int) -> list[Attempts]:
-        begun = []
-        for task in islice(self._tasks, most):
-            template = self._context.plan.template
-            sensor = sensor_of(template, task[0])
-            if self._sensor is None or self._sensor[0] != sensor:
-                self._sensor = sensor, draw_sensor(template, self._context.job.seed, sensor)
-            self.open[sensor] += 1
-            begun.append(Attempts(self._context, task, self._sensor[1]))
-        return begun
+    def _next(self, gel: Gel) -> Drawn | None:
+        """The next press of a pad; None when there is none, or enough of other pads have been drawn meanwhile."""
+        while gel not in self._drawn:
+            if sum(map(len, self._drawn.values())) >= MOST_DRAWN * self._batch or not self._draw():
+                return None
+        members = self._drawn[gel]
+        found = members.popleft()
+        if not members:
+            del self._drawn[gel]
+        return found
+
+    def _draw(self) -> bool:
+        """Draw an instance, of a trajectory whose last one failed if there is one; False when none is left."""
+        if not self._again and not self._begin():
+            return False
+        attempts = self._again.pop()
+        attempt = attempts.next(retry=False)
+        if attempt is not None:
+            self._drawn.setdefault(pad_key(attempt.press), deque()).append((attempts, attempt))
+        elif attempts.is_exhausted:
+            self._given_up.append(attempts)
+        else:
+            self._again.append(attempts)
+        return True
+
+    def _begin(self) -> bool:
+        task = next(self._tasks, None)
+        if task is None:
+            return False
+        template = self._context.plan.template
+        sensor = sensor_of(template, task[0])
+        if self._sensor is None or self._sensor[0] != sensor:
+            self._sensor = sensor, draw_sensor(template, self._context.job.seed, sensor)
+        self.open[sensor] += 1
+        self._again.append(Attempts(self._context, task, self._sensor[1]))
+        return True
+
+
+class _OfOnePad:
+    """Presses of one pad, drawn when they are asked for; `under_way` has what was drawn, by the press's number."""
+
+    def __init__(self, draw: Callable[[], Drawn | None]) -> None:
+        self._draw, self._numbers = draw, count()
+        self.under_way: dict[int, Drawn] = {}
+
+    def __iter__(self) -> "_OfOnePad":
+        return self
+
+    def __next__(self) -> Asked:
+        """The next one; after StopIteration there may be another, since a press that fails is followed by one."""
+        drawn = self._draw()
+        if drawn is None:
+            raise StopIteration
+        self.under_way[next(self._numbers)] = drawn
+        return drawn[1].press, drawn[1].frames
 
 
 def by_sensor(template: Template, ended: Iterable[tuple[int, Result]], open: Counter[int]) -> Iterator[list[Result]]:

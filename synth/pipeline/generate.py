@@ -38,6 +38,7 @@ from synth.pipeline.overlapped import outcomes_of_batches
 from synth.pipeline.producer import Producer
 from synth.pipeline.ray_pool import outcomes_of_ray
 from synth.pipeline.records import JobContext, Outcome, Task
+from synth.pipeline.shared_gpus import share_gpus
 from synth.pipeline.worker_pool import cores, outcomes_of_processes
 from synth.planning import Plan, plan, predict
 from synth.render.variant import Variant
@@ -198,6 +199,8 @@ def generate(
     planned = plan(scene, variant)
     job = make_job(planned, n, seed)
     count = planned.template.sampling.samples_per_trajectory
+    if planned.variant.is_on_gpu and n // count >= BATCH["cuda"]:  # fewer would not win back the start of the service
+        share_gpus()
     if (devices := _devices(planned, n // count, out, scheduling)) > 1:
         make = partial(_shard_on_device, planned.template, n, out, seed, planned.variant, scheduling, devices)
         summary = Summary.of_all(on_devices(make, devices, progress or (lambda done, asked_for: None)))

@@ -36,7 +36,7 @@ class Producer:
                 if pad is None:
                     result = simulate_press(attempt.press, attempt.frames)
                 else:
-                    ((_, result),) = simulate_presses([attempt.press], pad, [attempt.frames])
+                    ((_, result),) = simulate_presses([(attempt.press, attempt.frames)], pad)
             except InputError as error:
                 attempts.fail("simulate", str(error))
                 continue

@@ -144,10 +144,15 @@ def presses_of(scenes: Sequence[Scene], mesh: PadMesh, folder: Path | None = Non
 
 
 def simulate_scenes(
-    scenes: Sequence[Scene], mesh: PadMesh, folder: Path | None = None, device: str = "cpu", **options: Any
+    scenes: Sequence[Scene],
+    mesh: PadMesh,
+    folder: Path | None = None,
+    device: str = "cpu",
+    frames: Sequence[frozenset[int]] | None = None,
+    **options: Any,
 ) -> list[Trajectory]:
-    pad = prepare(scenes[0], mesh, device)
-    found = dict(simulate_presses(presses_of(scenes, mesh, folder), pad, **options))
+    asked = zip(presses_of(scenes, mesh, folder), frames or [None] * len(scenes), strict=True)
+    found = dict(simulate_presses(asked, prepare(scenes[0], mesh, device), **options))
     assert sorted(found) == list(range(len(scenes)))
     return [found[number] for number in range(len(scenes))]
 

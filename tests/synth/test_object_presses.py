@@ -88,7 +88,7 @@ def test_a_body_is_no_deeper_in_the_gel_than_allowed(folder: Path, monkeypatch: 
         return Press.of(drawn.model_copy(update={"numerics": numerics}), mesh, folder)
 
     def both(press: Press, frames: frozenset[int] | None = None) -> list[Trajectory]:
-        batched = simulate_presses([press], prepare(press.scene, mesh, "cpu"), frames=frames and [frames])
+        batched = simulate_presses([(press, frames)], prepare(press.scene, mesh, "cpu"))
         return [simulate_press(press, frames), *dict(batched).values()]
 
     found, allowed = both(soft(4.0, cube())), multipliers.DEEP * DEPTH
@@ -166,7 +166,9 @@ def test_a_hole_around_the_gel_touches_nothing_and_is_not_called_too_small(tmp_p
     around = scene(size, indenter=body, motion={"depth_mm": 0.5, "steps": 1}, numerics={"element": "p1p1"})
     mesh = graded_box(size, Focus((0.0, 0.0), (1.0, 1.0)), Counts((4, 4), (2, 2), 2))
     made = Press.of(around, mesh, tmp_path)
-    batched = simulate_presses([made], prepare(around, mesh, "cpu")) if is_batched else [(0, simulate_press(made))]
+    batched = (
+        simulate_presses([(made, None)], prepare(around, mesh, "cpu")) if is_batched else [(0, simulate_press(made))]
+    )
     ((_, found),) = batched
     assert found.status == "complete", found.reason
     assert found.states[-1].force_n == (0.0, 0.0, 0.0)

@@ -1,17 +1,18 @@
 """Many trajectories at once against one by one."""
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import pyvista as pv
 import warp as wp
 from commands import refused
-from pads import ELEMENT, MIXED, PUNCH, SPHERE, brick, dense, indenters, presses_of, same, scene, simulate_scenes
+from pads import ELEMENT, MIXED, PUNCH, SPHERE, brick, dense, indenters, same, scene, simulate_scenes
 
 from synth.mesh import PadMesh
+from synth.press.press import Press
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.batched import simulate_presses
@@ -27,7 +28,7 @@ from synth.simulate.batched.product import (
     store_bulk,
     store_contact,
 )
-from synth.simulate.batched.run import OPTIONS
+from synth.simulate.batched.run import OPTIONS, Asked
 from synth.simulate.contact import contact_stiffness
 from synth.simulate.material import uniform
 from synth.simulate.options import SolverOptions
@@ -103,7 +104,41 @@ def test_company_order_and_lost_samples_change_no_bit() -> None:
     assert same(second, simulate_scenes([good], thin)[0])
 
 
+def test_a_press_that_records_more_waits_for_a_run_with_room_for_it() -> None:
+    scenes = [scene(friction=0.4, motion={"depth_mm": 0.2, "steps": steps}) for steps in (1, 1, 3, 1)]
+    found = simulate_scenes(scenes, MESH, batch=2)
+    assert [len(result.states) for result in found] == [2, 2, 4, 2]
+    assert same(found[2], simulate_scenes([scenes[2]], MESH)[0])
+
+
+def test_more_presses_are_asked_for_after_there_were_none() -> None:
+    """As one that fails is followed by another: it comes where the last lane has just ended, or another still runs."""
+    posed = scene(friction=0.4, motion={"depth_mm": 0.2})
+    press = Press.of(posed, MESH)
+
+    class Presses:
+        waiting = 1
+
+        def __iter__(self) -> Iterator[Asked]:
+            return self
+
+        def __next__(self) -> Asked:
+            if self.waiting == 0:
+                raise StopIteration
+            self.waiting -= 1
+            return press, None
+
+    given, found = Presses(), []
+    for number, result in simulate_presses(given, prepare(posed, MESH, "cpu"), batch=2):
+        found.append(result)
+        given.waiting = {0: 2, 1: 1}.get(number, 0)
+    assert len(found) == 4
+    assert all(same(result, found[0]) for result in found)
+
+
 def test_indenters_that_find_no_point_are_told_apart_and_grids_may_be_unequal(tmp_path: Path) -> None:
+    import pyvista as pv  # which need not be there for what runs on a GPU
+
     size = (8.0, 6.0, 2.5)
     needle = {"shape": "sphere", "radius_mm": 0.1}
     posed = scene(size, indenter=needle, motion={"depth_mm": 0.5, "steps": 2, "position_mm": (0.3, 0.2)})
@@ -190,11 +225,9 @@ def test_scenes_must_share_the_pad_which_serves_several_runs() -> None:
     soft, stiffening, short = {"poisson_ratio": 0.45}, {"stiffening": [0.1, 0.0]}, {"max_step_mm": 0.05}
     for other in (scene(gel=soft), scene(gel=stiffening), scene(numerics=short)):
         refused("must share the gel's materials and all numerics", simulate_scenes, [scene(), other], MESH)
-        refused("must share", list, simulate_presses(presses_of([other], MESH), pad))
-    with pytest.raises(ValueError, match="1 sets of frames for 2 presses"):
-        simulate_scenes([scene(), scene()], MESH, frames=[frozenset({1})])
+        refused("must share", list, simulate_presses([(Press.of(other, MESH), None)], pad))
     posed = scene(friction=0.4, motion={"depth_mm": 0.2})
-    pad, presses = prepare(posed, MESH, "cpu"), presses_of([posed], MESH)
+    pad, presses = prepare(posed, MESH, "cpu"), [(Press.of(posed, MESH), None)]
     (_, one), (_, other) = (next(simulate_presses(presses, pad)) for _ in range(2))
     assert same(one, other)
     assert list(simulate_presses([], pad)) == []

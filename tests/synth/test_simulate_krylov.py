@@ -6,57 +6,51 @@ import numpy as np
 import pytest
 import scipy.sparse
 import warp as wp
+from pads import SIZE, brick, scene
 
+from synth.press.press import Press
 from synth.simulate.batched import krylov as kernels
 from synth.simulate.batched.gemm import dense
 from synth.simulate.batched.krylov import Krylov, arnoldi, block_size, flat, padded, round_rows
-from synth.simulate.batched.lanes import PREDICTOR_READY, READY, Lanes, Settings, bits, select
+from synth.simulate.batched.lane import Lane
+from synth.simulate.batched.lanes import Number, Order, Seen, select
 from synth.simulate.batched.pad import inverse
 from synth.simulate.linear import GMRES_LIMIT
 from synth.simulate.options import STANDARD
+from synth.simulate.policy.load_steps import LoadSteps
+from synth.simulate.policy.requests import Solve
 
 
-def _systems(
-    relative: list[float],
-    iteration: list[int],
-    device: str = "cpu",
-    forcing: float = STANDARD.forcing,
-    phase: int = READY,
-) -> tuple[Lanes, Krylov, Settings]:
-    """Lanes that are ready for a linear solve, its right side of norm 1, the one before of norm 20."""
-    rows, batch = padded(150), len(relative)
-    lanes, krylov, settings = Lanes(), Krylov(), Settings()
-    sizes = kernels.shapes(rows, batch)
-    for struct, kind in ((lanes, Lanes), (krylov, Krylov)):
-        for name, variable in kind.vars.items():
-            shape = sizes[name] if struct is krylov else batch
-            setattr(struct, name, wp.zeros(shape, dtype=variable.type.dtype, device=device))
-    lanes.phase.fill_(phase)
-    lanes.norm.fill_(1.0)
-    krylov.size.fill_(20.0)
-    lanes.tolerance.fill_(1e-4)
-    lanes.relative.assign(np.array(relative))
-    lanes.iteration.assign(np.array(iteration, dtype=np.int32))
-    settings.forcing = forcing
-    wp.launch(kernels.begin_solve, batch, inputs=[lanes, settings, krylov], device=device)
-    return lanes, krylov, settings
+def _systems(batch: int, device: str = "cpu") -> tuple[Krylov, list[Any]]:
+    """Lanes at the start of a linear solve, its right side of norm 1, and their mask and numbers."""
+    krylov, sizes = Krylov(), kernels.shapes(padded(150), batch)
+    for name, variable in Krylov.vars.items():
+        setattr(krylov, name, wp.zeros(sizes[name], dtype=variable.type.dtype, device=device))
+    numbers = np.zeros((batch, len(Number)))
+    numbers[:, [Number.NORM, Number.GOAL]] = 1.0, 1e-3
+    told = [wp.ones(batch, dtype=wp.int32, device=device), wp.array(numbers, dtype=wp.float64, device=device)]
+    wp.launch(kernels.begin_solve, batch, inputs=[*told, krylov], device=device)
+    return krylov, told
 
 
-def test_lanes_are_selected_by_their_phase() -> None:
-    lanes, mask = Lanes(), wp.zeros(8, dtype=wp.int32, device="cpu")
-    lanes.phase = wp.array(np.arange(8), dtype=wp.int32, device="cpu")
-    wp.launch(select, 8, inputs=[lanes, bits(2, 5), mask], device="cpu")
-    assert mask.numpy().tolist() == [0, 0, 1, 0, 0, 1, 0, 0]
+def test_lanes_are_selected_by_their_orders() -> None:
+    orders, mask = (wp.array(values, dtype=wp.int32, device="cpu") for values in (np.arange(8), np.zeros(8)))
+    wp.launch(select, 8, inputs=[orders, int(Order.RESTORE_PASS | Order.REPEAT), mask], device="cpu")
+    assert mask.numpy().tolist() == [0, 0, 1, 1, 1, 1, 1, 1]
 
 
 def test_linear_solves_are_as_exact_as_newton_needs() -> None:
     """The first; after a fall to a twentieth 0.9 / 400; near the tolerance 0.3 times what is left; the most."""
-    krylov = _systems([1.0, 1.0, 5e-3, 2e-4], [0, 1, 1, 1])[1]
-    np.testing.assert_allclose(krylov.goal.numpy(), [0.03, 0.00225, 0.006, 0.03], rtol=1e-6)
-    # The predictor at a turn has no Newton iteration before it.
-    for phase in (READY, PREDICTOR_READY):
-        assert np.all(_systems([1.0, 5e-3], [0, 1], "cpu", 1e-5, phase)[1].goal.numpy() == np.float32(1e-5))
-    assert _systems([1.0], [0], phase=PREDICTOR_READY)[1].goal.numpy() == np.float32(1e-3)
+    posed = scene()
+    steps = LoadSteps(Press.of(posed, brick()).path, SIZE, False, posed.numerics, STANDARD)
+
+    def goals(forcing: float, *solves: tuple[float, int]) -> list[float]:
+        lane = Lane(0, steps, np.zeros(len(Number)), forcing)
+        return [lane._goal(Solve(relative, 1e-4, iteration), 1 / 20) for relative, iteration in solves]
+
+    given = ((1.0, 0), (1.0, 1), (5e-3, 1), (2e-4, 1))
+    assert goals(0.03, *given) == pytest.approx([0.03, 0.00225, 0.006, 0.03], rel=1e-12)
+    assert goals(1e-5, *given) == [1e-5] * 4
 
 
 @pytest.mark.parametrize(("device", "batch"), [("cpu", 3), pytest.param("cuda", 600, marks=pytest.mark.cuda)])
@@ -74,7 +68,7 @@ def test_every_lane_solves_its_own_system(device: str, batch: int) -> None:
     rights /= np.linalg.norm(rights, axis=1, keepdims=True)
 
     def solved(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        lanes, krylov, _ = _systems([1.0] * len(which), [0] * len(which), device)
+        krylov, _ = _systems(len(which), device)
         krylov.goal.assign(goals[which])
         first = np.zeros(flat(krylov.current).shape, dtype=np.float32)
         first[:, :size] = rights[which]
@@ -91,8 +85,9 @@ def test_every_lane_solves_its_own_system(device: str, batch: int) -> None:
             flat(krylov.preconditioned).assign(preconditioned)
             flat(krylov.product).assign(product)
             wp.launch_tiled(arnoldi(rows), inputs=[krylov], **launch)
-        begun = wp.zeros(len(which), dtype=wp.int32, device=device)
-        wp.launch_tiled(kernels.solution(rows), inputs=[lanes, krylov, begun], **launch)
+        seen = wp.zeros((len(which), len(Seen)), dtype=wp.float64, device=device)
+        wp.launch_tiled(kernels.solution(rows), inputs=[krylov, seen], **launch)
+        assert (seen.numpy()[:, [Seen.DONE, Seen.FINITE]] == 1).all()
         count = krylov.k.numpy()
         return flat(krylov.step).numpy(), np.abs(krylov.residual.numpy()[np.arange(len(which)), count])
 
@@ -107,7 +102,7 @@ def test_every_lane_solves_its_own_system(device: str, batch: int) -> None:
 
 
 def test_a_solve_that_misses_its_goal_ends_at_the_limit() -> None:
-    krylov = _systems([1.0], [0])[1]
+    krylov, _ = _systems(1)
     krylov.goal.fill_(0.0)
     krylov.k.fill_(GMRES_LIMIT - 2)
     product = flat(krylov.product)
@@ -145,13 +140,12 @@ def test_a_preconditioner_takes_tf32_from_the_first_vector_on() -> None:
     np.testing.assert_allclose(found[:150, :150], np.linalg.inv(matrix + matrix.T), rtol=1 / 2000)
     assert np.count_nonzero(found) == np.count_nonzero(found[:150, :150])
     assert (_bits(found) == 0).all()
-    lanes, krylov, _ = _systems([1.0] * 2, [0] * 2)
-    lanes.phase.fill_(READY)
+    krylov, told = _systems(2)
     rows = flat(krylov.current).shape[1]
     free = np.append(np.arange(150), np.full(rows - 150, -1)).astype(np.int32)
     force = wp.array(rng.standard_normal((2, 50, 3)), dtype=wp.vec3d, device="cpu")
     volume = wp.zeros((2, 0), dtype=wp.float64, device="cpu")
-    inputs = [lanes, wp.array(free, device="cpu"), force, volume, krylov]
+    inputs = [*told, wp.array(free, device="cpu"), force, volume, krylov]
     wp.launch(kernels.begin_vectors, (2, rows // 4), inputs=inputs, device="cpu")
     first = flat(krylov.current).numpy().copy()
     flat(krylov.product).assign(rng.standard_normal((2, rows)).astype(np.float32))

@@ -12,7 +12,7 @@ import warp as wp
 
 from synth.simulate.batched.fields import ContactMemory, Fields
 from synth.simulate.batched.krylov import Krylov, flat, shapes
-from synth.simulate.batched.lanes import Lanes
+from synth.simulate.batched.lanes import Number, Seen
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.product import STORED, STORED_YEOH, SingleTables
 from synth.simulate.batched.reductions import SCALARS
@@ -36,7 +36,9 @@ class BatchArrays:
 
         nodes, pressures, elements = len(space.points), space.pressures if pad.mixed else 0, len(space.nodes)
         self.points = (batch, len(space.faces), len(space.element.face_weights))
-        self.lanes: Lanes = zeros_of(Lanes, lambda _: (batch,), device)
+        self.orders, self.numbers = zeros(batch, wp.int32), zeros((batch, len(Number)), wp.float64)
+        self.seen = zeros((batch, len(Seen)), wp.float64)
+        self.viscosity, self.shares = zeros(batch, wp.float64), zeros(batch, wp.float64)
         self.fields: Fields = zeros_of(Fields, lambda n: (batch, nodes if n.endswith("_u") else pressures), device)
         self.contact: ContactState = zeros_of(ContactState, lambda _: self.points, device)
         self.saved: ContactMemory = zeros_of(ContactMemory, lambda _: self.points, device)
@@ -55,7 +57,7 @@ class BatchArrays:
         )
         self.records = zeros((batch, records, SCALARS + 3 * nodes + 3 * len(space.surface_nodes)), wp.float64)
         self.sums = zeros((batch, 8), wp.float64)
-        self.mask, self.begun, self.assignment = (zeros(batch, wp.int32) for _ in range(3))
+        self.mask, self.found = zeros(batch, wp.int32), zeros(batch, wp.int32)
         stored = (elements, len(space.element.weights), STORED_YEOH if pad.yeoh else STORED, batch)
         self.stored = zeros(stored, wp.float32)
         self.inverting = zeros((elements, batch), wp.int32)

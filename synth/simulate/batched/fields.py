@@ -1,12 +1,17 @@
-"""Moves of the lanes' fields between state, iterate and trial, and of contact's memory, as Warp kernels."""
+"""Moves of the lanes' fields between state, iterate, trial and snapshots, and of contact's memory, as Warp kernels."""
 
 from typing import Any
 
 import warp as wp
 
-from synth.simulate.batched import lanes as phases
-from synth.simulate.batched.lanes import Lanes
+from synth.simulate.batched.lanes import RATIO, SHARE, Order
 from synth.simulate.contact import FAR, ContactState
+
+TAKE, KEEP_STEP, KEEP_PASS = (wp.constant(int(o)) for o in (Order.TAKE, Order.KEEP_STEP, Order.KEEP_PASS))
+RESTORE_STEP, ACCEPT, BEGIN, PREDICT, TRY = (
+    wp.constant(int(o)) for o in (Order.RESTORE_STEP, Order.ACCEPT, Order.BEGIN, Order.PREDICT, Order.TRY)
+)
+BACK_TO_PASS = wp.constant(int(Order.RESTORE_PASS | Order.REPEAT))
 
 
 @wp.struct
@@ -16,7 +21,7 @@ class Fields:
     Attributes:
         state, previous: the last two accepted states of the path.
         iterate, trial: of Newton's method and its line search.
-        recorded: the last solution at a recorded state.
+        after_step, before_pass: snapshots of the iterate.
     """
 
     state_u: wp.array2d(dtype=wp.vec3d)
@@ -27,25 +32,25 @@ class Fields:
     iterate_p: wp.array2d(dtype=wp.float64)
     trial_u: wp.array2d(dtype=wp.vec3d)
     trial_p: wp.array2d(dtype=wp.float64)
-    recorded_u: wp.array2d(dtype=wp.vec3d)
-    recorded_p: wp.array2d(dtype=wp.float64)
+    after_step_u: wp.array2d(dtype=wp.vec3d)
+    after_step_p: wp.array2d(dtype=wp.float64)
+    before_pass_u: wp.array2d(dtype=wp.vec3d)
+    before_pass_p: wp.array2d(dtype=wp.float64)
 
 
 @wp.kernel
-def clear_fields(lanes: Lanes, fields: Fields):
+def clear_fields(mask: wp.array(dtype=wp.int32), fields: Fields):
     """One thread per (lane, node and then pressure): the undeformed state in fresh lanes."""
     s, i = wp.tid()
-    if lanes.phase[s] != phases.FRESH:
+    if mask[s] == 0:
         return
     count = fields.state_u.shape[1]
     if i < count:
         fields.state_u[s, i] = wp.vec3d()
         fields.previous_u[s, i] = wp.vec3d()
-        fields.iterate_u[s, i] = wp.vec3d()
     else:
         fields.state_p[s, i - count] = wp.float64(0.0)
         fields.previous_p[s, i - count] = wp.float64(0.0)
-        fields.iterate_p[s, i - count] = wp.float64(0.0)
 
 
 @wp.func
@@ -56,7 +61,9 @@ def node_step(step: wp.array2d(dtype=wp.float32), s: int, row: int) -> wp.vec3d:
 
 @wp.kernel
 def compute_trial(
-    lanes: Lanes,
+    orders: wp.array(dtype=wp.int32),
+    numbers: wp.array2d(dtype=wp.float64),
+    found: wp.array(dtype=wp.int32),
     mask: wp.array(dtype=wp.int32),
     step: wp.array2d(dtype=wp.float32),
     node_row: wp.array(dtype=wp.int32),
@@ -66,18 +73,19 @@ def compute_trial(
     viscous: wp.array2d(dtype=wp.vec3d),
     volume: wp.array2d(dtype=wp.float64),
 ):
-    """One thread per (lane, node and then pressure): the trial, and zeros for its residual and viscous force.
+    """One thread per (lane, node and then pressure): what is evaluated, and zeros for its residual and viscous force.
 
+    That is the iterate; a share of the step further where it is tried, all of it where it was found in this cycle.
     step: (B, rows); node_row: first row of a node's displacement or -1 where it is held.
     """
     s, i = wp.tid()
     if mask[s] == 0:
         return
     scale = wp.float64(0.0)
-    if lanes.phase[s] == phases.SEARCH:
-        scale = lanes.scale[s]
-        if lanes.relaxing[s] > 0:
-            scale = lanes.part[s]
+    if (orders[s] & TRY) != 0:
+        scale = numbers[s, SHARE]
+    if found[s] == 1:
+        scale = wp.float64(1.0)
     count = fields.state_u.shape[1]
     if i < count:
         u = fields.iterate_u[s, i]
@@ -98,7 +106,7 @@ def compute_trial(
 
 @wp.kernel
 def apply_predictor(
-    begun: wp.array(dtype=wp.int32),
+    orders: wp.array(dtype=wp.int32),
     share: wp.float64,
     step: wp.array2d(dtype=wp.float32),
     node_row: wp.array(dtype=wp.int32),
@@ -107,7 +115,7 @@ def apply_predictor(
 ):
     """One thread per (lane, node and then pressure): the first iterate, the state and 1/share times step."""
     s, i = wp.tid()
-    if begun[s] == 0:
+    if (orders[s] & PREDICT) == 0:
         return
     count = fields.state_u.shape[1]
     if i < count:
@@ -123,60 +131,84 @@ def apply_predictor(
 
 
 @wp.func
-def _move(
-    lanes: Lanes,
-    keep: int,
+def _to_solution(
+    order: int,
+    s: int,
+    i: int,
+    iterate: wp.array2d(dtype=Any),
+    trial: wp.array2d(dtype=Any),
+    after_step: wp.array2d(dtype=Any),
+    before_pass: wp.array2d(dtype=Any),
+):
+    x = iterate[s, i]
+    if (order & TAKE) != 0:
+        x = trial[s, i]
+    if (order & BACK_TO_PASS) != 0:
+        x = before_pass[s, i]
+    iterate[s, i] = x
+    if (order & KEEP_STEP) != 0:
+        after_step[s, i] = x
+    if (order & KEEP_PASS) != 0:
+        before_pass[s, i] = x
+
+
+@wp.kernel
+def to_solution(orders: wp.array(dtype=wp.int32), f: Fields):
+    """One thread per (lane, node and then pressure): the iterate that a solve has ended with, and snapshots of it."""
+    s, i = wp.tid()
+    order = orders[s]
+    if (order & (TAKE | BACK_TO_PASS | KEEP_STEP | KEEP_PASS)) == 0:
+        return
+    count = f.state_u.shape[1]
+    if i < count:
+        _to_solution(order, s, i, f.iterate_u, f.trial_u, f.after_step_u, f.before_pass_u)
+    else:
+        _to_solution(order, s, i - count, f.iterate_p, f.trial_p, f.after_step_p, f.before_pass_p)
+
+
+@wp.func
+def _to_start(
+    order: int,
+    ratio: wp.float64,
     s: int,
     i: int,
     state: wp.array2d(dtype=Any),
     previous: wp.array2d(dtype=Any),
     iterate: wp.array2d(dtype=Any),
-    trial: wp.array2d(dtype=Any),
-    recorded: wp.array2d(dtype=Any),
+    after_step: wp.array2d(dtype=Any),
 ):
-    kind = lanes.move[s]
     x = iterate[s, i]
-    if kind == phases.TAKE_TRIAL:
-        x = trial[s, i]
-    elif kind == phases.RESTORE_RECORDED or kind == phases.REPEAT_RECORDED:
-        x = recorded[s, i]
-    elif kind == phases.RESET:
-        x = state[s, i]
-        if lanes.predicted[s] == 1:
-            x += lanes.ratio[s] * (x - previous[s, i])
-    elif kind == phases.ACCEPT:
+    if (order & RESTORE_STEP) != 0:
+        x = after_step[s, i]
+    if (order & ACCEPT) != 0:
         previous[s, i] = state[s, i]
         state[s, i] = x
-    elif kind == phases.ROLL_BACK:
-        x = previous[s, i]
-        state[s, i] = x
+    if (order & BEGIN) != 0:
+        x = state[s, i]
+        if ratio != wp.float64(0.0):
+            x += ratio * (x - previous[s, i])
     iterate[s, i] = x
-    if keep == 1:
-        recorded[s, i] = x
 
 
 @wp.kernel
-def move_fields(lanes: Lanes, solved: int, f: Fields):
-    """One thread per (lane, node and then pressure): what `lanes.move` says.
-
-    In phases of the set `solved` the solution at a recorded state is stored, in case a later pass fails.
-    """
+def to_start(orders: wp.array(dtype=wp.int32), numbers: wp.array2d(dtype=wp.float64), f: Fields):
+    """One thread per (lane, node and then pressure): the end of a step is accepted, and the next one begins."""
     s, i = wp.tid()
-    count = f.state_u.shape[1]
-    keep = (solved >> lanes.phase[s]) & 1
-    if lanes.move[s] == 0 and keep == 0:
+    order = orders[s]
+    if (order & (RESTORE_STEP | ACCEPT | BEGIN)) == 0:
         return
+    count, ratio = f.state_u.shape[1], numbers[s, RATIO]
     if i < count:
-        _move(lanes, keep, s, i, f.state_u, f.previous_u, f.iterate_u, f.trial_u, f.recorded_u)
+        _to_start(order, ratio, s, i, f.state_u, f.previous_u, f.iterate_u, f.after_step_u)
     else:
-        _move(lanes, keep, s, i - count, f.state_p, f.previous_p, f.iterate_p, f.trial_p, f.recorded_p)
+        _to_start(order, ratio, s, i - count, f.state_p, f.previous_p, f.iterate_p, f.after_step_p)
 
 
 @wp.kernel
-def clear_contact(lanes: Lanes, contact: ContactState):
+def clear_contact(mask: wp.array(dtype=wp.int32), contact: ContactState):
     """One thread per (lane, face, point): nothing touched before in a fresh lane, not even what touches at once."""
     s, f, q = wp.tid()
-    if lanes.phase[s] != phases.FRESH:
+    if mask[s] == 0:
         return
     contact.normal[s, f, q] = wp.float64(0.0)
     contact.tangent[s, f, q] = wp.vec3d()
@@ -214,24 +246,15 @@ def copy_memory(mask: wp.array(dtype=wp.int32), source: ContactMemory, target: C
 
 
 @wp.kernel
-def save_multipliers(
-    lanes: Lanes, contact: ContactState, normal: wp.array3d(dtype=wp.float64), tangent: wp.array3d(dtype=wp.vec3d)
+def copy_multipliers(
+    mask: wp.array(dtype=wp.int32),
+    normal: wp.array3d(dtype=wp.float64),
+    tangent: wp.array3d(dtype=wp.vec3d),
+    to_normal: wp.array3d(dtype=wp.float64),
+    to_tangent: wp.array3d(dtype=wp.vec3d),
 ):
-    """One thread per (lane, face, point): before a pass begins."""
+    """One thread per (lane, face, point): before a pass, or after one that failed."""
     s, f, q = wp.tid()
-    if lanes.new_share[s] == wp.float64(0.0):
-        return
-    normal[s, f, q] = contact.normal[s, f, q]
-    tangent[s, f, q] = contact.tangent[s, f, q]
-
-
-@wp.kernel
-def restore_multipliers(
-    lanes: Lanes, normal: wp.array3d(dtype=wp.float64), tangent: wp.array3d(dtype=wp.vec3d), contact: ContactState
-):
-    """One thread per (lane, face, point): after a pass failed."""
-    s, f, q = wp.tid()
-    if lanes.move[s] != phases.RESTORE_RECORDED:
-        return
-    contact.normal[s, f, q] = normal[s, f, q]
-    contact.tangent[s, f, q] = tangent[s, f, q]
+    if mask[s] == 1:
+        to_normal[s, f, q] = normal[s, f, q]
+        to_tangent[s, f, q] = tangent[s, f, q]

@@ -20,17 +20,14 @@ from functools import cache
 
 import warp as wp
 
-from synth.simulate.batched import lanes as phases
-from synth.simulate.batched.lanes import Lanes, Settings
-from synth.simulate.linear import GMRES_LIMIT, GMRES_TOLERANCE
+from synth.simulate.batched.lanes import GOAL, NORM, STICKING, Seen
+from synth.simulate.linear import GMRES_LIMIT
 
+SEEN_DONE, SEEN_FINITE = wp.constant(int(Seen.DONE)), wp.constant(int(Seen.FINITE))
 WAITING, RUNNING, DONE = wp.constant(0), wp.constant(1), wp.constant(2)
 LIMIT = wp.constant(GMRES_LIMIT)
 ZERO = wp.constant(wp.float32(0.0))
 ONE = wp.constant(wp.float32(1.0))
-MIN_GOAL = wp.constant(wp.float64(GMRES_TOLERANCE))
-"""Smallest goal of a linear solve, unless `Settings.forcing`, the largest, is smaller still."""
-REDUCTION_FACTOR, SAFETY_FACTOR = wp.constant(wp.float64(0.9)), wp.constant(wp.float64(0.3))
 MAX_PER_THREAD = 84
 """Numbers of a vector that one thread holds, at most, so that two vectors fit its 255 registers."""
 SMALLEST_BLOCK, LARGEST_BLOCK = 64, 512
@@ -109,7 +106,8 @@ def padded(unknowns: int) -> int:
 
 @wp.kernel
 def begin_vectors(
-    lanes: Lanes,
+    mask: wp.array(dtype=wp.int32),
+    numbers: wp.array2d(dtype=wp.float64),
     free: wp.array(dtype=wp.int32),
     force: wp.array2d(dtype=wp.vec3d),
     volume: wp.array2d(dtype=wp.float64),
@@ -120,9 +118,9 @@ def begin_vectors(
     free: (rows,) number of the unknown, displacements of all nodes first, or -1 for rows that fill up.
     """
     s, i = wp.tid()
-    if lanes.phase[s] != phases.READY and lanes.phase[s] != phases.PREDICTOR_READY:
+    if mask[s] == 0:
         return
-    size = lanes.norm[s]
+    size = numbers[s, NORM]
     moves = 3 * force.shape[1]
     found = wp.vec4f()
     for k in range(4):
@@ -138,40 +136,18 @@ def begin_vectors(
     krylov.current[s, i] = rounded_four(found)
 
 
-@wp.func
-def _goal(lanes: Lanes, settings: Settings, s: int, before: wp.float64) -> wp.float64:
-    """The second choice of Eisenstat & Walker (SIAM J. Sci. Comput. 17, 1996), and no more than Newton's method needs.
-
-    before: norm of the last solve's right side. With these bounds their safeguard has nothing to do.
-    """
-    loosest = wp.float64(settings.forcing)
-    tightest = wp.min(MIN_GOAL, loosest)
-    if lanes.phase[s] == phases.PREDICTOR_READY:
-        return tightest
-    goal = loosest
-    if lanes.iteration[s] > 0:
-        fallen = lanes.norm[s] / before
-        goal = REDUCTION_FACTOR * fallen * fallen
-    goal = wp.max(goal, SAFETY_FACTOR * lanes.tolerance[s] / lanes.relative[s])
-    return wp.max(wp.min(goal, loosest), tightest)
-
-
 @wp.kernel
-def begin_solve(lanes: Lanes, settings: Settings, krylov: Krylov):
-    """One thread per lane."""
+def begin_solve(mask: wp.array(dtype=wp.int32), numbers: wp.array2d(dtype=wp.float64), krylov: Krylov):
+    """One thread per lane: where a right side and a matrix are ready, iterations begin."""
     s = wp.tid()
-    phase = lanes.phase[s]
-    if phase != phases.READY and phase != phases.PREDICTOR_READY:
+    if mask[s] == 0:
         return
-    krylov.goal[s] = wp.float32(_goal(lanes, settings, s, krylov.size[s]))
-    krylov.size[s] = lanes.norm[s]
+    krylov.goal[s] = wp.float32(numbers[s, GOAL])
+    krylov.size[s] = numbers[s, NORM]
     krylov.k[s] = 0
-    lanes.phase[s] = phases.LINEAR
-    if phase == phases.PREDICTOR_READY:
-        lanes.phase[s] = phases.PREDICTOR_LINEAR
     krylov.residual[s, 0] = ONE
     krylov.running[s] = RUNNING
-    if lanes.norm[s] == wp.float64(0.0):
+    if numbers[s, NORM] == wp.float64(0.0):
         krylov.running[s] = DONE
 
 
@@ -236,7 +212,7 @@ def arnoldi(rows: int) -> wp.Kernel:
 
 @cache
 def solution(rows: int) -> wp.Kernel:
-    """The kernel that finds the solution where a solve is done, and the lane's next phase; one block per lane.
+    """The kernel that finds the solution where a solve is done, and tells that it is; one block per lane.
 
     Each thread substitutes backwards by itself, since threads do not wait for each other to read a tile before it
     changes in shared memory.
@@ -246,11 +222,10 @@ def solution(rows: int) -> wp.Kernel:
     bounds = (block_size(rows), max(1, RESIDENT_THREADS // block_size(rows)))
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=bounds)
-    def finish(lanes: Lanes, krylov: Krylov, begun: wp.array(dtype=wp.int32)):
-        """begun: (B,) 1 where the solution is that of the rigid-motion predictor."""
+    def finish(krylov: Krylov, seen: wp.array2d(dtype=wp.float64)):
         s, thread = wp.tid()
         if thread == 0:
-            begun[s] = 0
+            seen[s, SEEN_DONE] = wp.float64(0.0)
         if krylov.running[s] != DONE:
             return
         k = krylov.k[s]
@@ -272,28 +247,21 @@ def solution(rows: int) -> wp.Kernel:
             z = wp.tile_load(krylov.corrections[s, j], shape=count, bounds_check=False)
             wp.tile_axpy(weight, z, total)
         wp.tile_store(krylov.step[s], total * wp.float32(krylov.size[s]), bounds_check=False)
-        if thread > 0:
-            return
-        if lanes.phase[s] == phases.PREDICTOR_LINEAR:
-            lanes.phase[s] = phases.START
-            if finite == 1:
-                lanes.predicted[s] = 1
-                begun[s] = 1
-        elif finite == 1:
-            lanes.phase[s] = phases.SEARCH
-            lanes.scale[s] = wp.float64(1.0)
-        else:
-            lanes.phase[s] = phases.FAILED
+        if thread == 0:
+            seen[s, SEEN_DONE] = wp.float64(1.0)
+            seen[s, SEEN_FINITE] = wp.float64(finite)
 
     return finish
 
 
 @wp.kernel
-def release(krylov: Krylov):
-    """One thread per lane: a solution that was taken leaves the lane waiting."""
+def release(krylov: Krylov, orders: wp.array(dtype=wp.int32), found: wp.array(dtype=wp.int32)):
+    """One thread per lane: a solution leaves the lane waiting; its whole step is tried unless it is a predictor's."""
     s = wp.tid()
+    found[s] = 0
     if krylov.running[s] == DONE:
         krylov.running[s] = WAITING
+        found[s] = wp.where((orders[s] & STICKING) != 0, 0, 1)
 
 
 HALF, KEPT = wp.constant(wp.uint32(0x1000)), wp.constant(wp.uint32(0xFFFFE000))

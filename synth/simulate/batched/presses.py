@@ -5,113 +5,97 @@ from collections.abc import Sequence
 import numpy as np
 
 from synth.arrays import FloatArray
+from synth.press.distance import SHAPE_LENGTH
 from synth.press.press import Press
-from synth.simulate.batched.lanes import COMPLETE, NO_CONTACT, NO_EQUILIBRIUM, TOO_DEEP, Presses
+from synth.simulate.batched.lanes import Presses
 from synth.simulate.batched.reductions import SCALARS
-from synth.simulate.policy.multipliers import allowed_share
+from synth.simulate.policy.requests import Record
 from synth.simulate.space import Space
 from synth.simulate.tables import struct_of
-from synth.simulate.trajectory import State, Trajectory, at_rest, no_contact, not_converged, too_deep
+from synth.simulate.trajectory import State, Trajectory, at_rest
 
 
-def press_tables(
-    presses: Sequence[Press], frames: Sequence[frozenset[int]] | None, d: str
-) -> tuple[Presses, tuple[int, int, int]]:
-    """All presses, of one pad, on Warp device d, and the counts of their largest distance grid.
+class PressTable:
+    """The presses in the lanes, by columns; row s is lane s's.
 
-    `frames` are the numbers of each press's states that are to be corrected, by default all.
+    `kind` (B,) and `shape` (B, k) are of the bodies, see `synth.simulate.contact.Indenters`.
     """
-    paths = [press.path for press in presses]
-    bodies = [path.body for path in paths]
-    kinds = []
-    for number, path in enumerate(paths):
-        wanted = None if frames is None else frames[number]
-        kind = {float(r): 2 if wanted is None or k in wanted else 1 for k, r in enumerate(path.records(), 1)}
-        kinds.append(np.array([kind.get(float(stop), 0) for stop in path.waypoints()]))
-    grids = {_grid_key(body.coefficients): body.coefficients for body in bodies}
-    numbers = {key: number for number, key in enumerate(grids)}
-    counts = tuple(int(n) for n in np.max([grid.shape for grid in grids.values()], axis=0))
-    padded = np.zeros((len(grids), *counts))
-    for room, grid in zip(padded, grids.values(), strict=True):
-        room[tuple(slice(0, n) for n in grid.shape)] = grid
-    size_mm = presses[0].mesh.size_mm
-    columns = {
-        "corners": _stacked([path.corners for path in paths]),
-        "ends": _stacked([path.ends for path in paths]),
-        "legs": [len(path.ends) for path in paths],
-        "waypoints": _stacked([path.waypoints() for path in paths]),
-        "kind_of": _stacked(kinds),
-        "stops": [len(path.waypoints()) for path in paths],
-        "press_end": [path.press_mm for path in paths],
-        "deepest": [path.depth_scale_mm for path in paths],
-        "over_pad": [path.is_over(size_mm) for path in paths],
-        "origin": [np.zeros(3) if path.frame is None else path.frame.origin for path in paths],
-        "axes": [np.eye(3) if path.frame is None else path.frame.axes for path in paths],
-        "position": [path.motion.position_mm for path in paths],
-        "reach": [path.body.reach_mm - path.face_mm for path in paths],
-        "rotation": [body.rotation for body in bodies],
-        "kind": [body.kind for body in bodies],
-        "shape": [body.shape for body in bodies],
-        "grid": [numbers[_grid_key(body.coefficients)] for body in bodies],
-        "grids": padded.reshape(len(grids), -1),
-        "friction": [press.scene.contact.friction for press in presses],
-        "sharpness": [press.scene.numerics.penalty * press.path.body.sharpness for press in presses],
-    }
-    return struct_of(Presses, d, **columns), (counts[0], counts[1], counts[2])
+
+    def __init__(self, batch: int, device: str) -> None:
+        self._device = device
+        self.kind, self.shape = np.zeros(batch, dtype=np.int32), np.zeros((batch, SHAPE_LENGTH))
+        widths: dict[str, tuple[int, ...]] = {
+            "corners": (1, 4), "ends": (1,), "origin": (3,), "axes": (3, 3), "position": (2,), "reach": (),
+            "rotation": (3, 3), "friction": (), "sharpness": (),
+        }  # fmt: skip
+        self._columns: dict[str, np.ndarray] = {name: np.zeros((batch, *width)) for name, width in widths.items()}
+        self._columns["legs"] = np.zeros(batch, dtype=np.int32)
+
+    def put(self, lane: int, press: Press) -> None:
+        """A press begins in a lane."""
+        columns, path = self._columns, press.path
+        body, legs = path.body, len(path.ends)
+        self.kind[lane], self.shape[lane] = body.kind, body.shape
+        for name, values in (("corners", path.corners), ("ends", path.ends)):
+            column = columns[name]
+            if column.shape[1] < len(values):
+                columns[name] = column = padded(column, (len(column), len(values), *column.shape[2:]))
+            column[lane, : len(values)] = values
+        row = {
+            "legs": legs,
+            "origin": np.zeros(3) if path.frame is None else path.frame.origin,
+            "axes": np.eye(3) if path.frame is None else path.frame.axes,
+            "position": path.motion.position_mm,
+            "reach": body.reach_mm - path.face_mm,
+            "rotation": body.rotation,
+            "friction": press.scene.contact.friction,
+            "sharpness": press.scene.numerics.penalty * body.sharpness,
+        }
+        for name, value in row.items():
+            columns[name][lane] = value
+
+    def on_device(self) -> Presses:
+        """A copy for kernels."""
+        return struct_of(Presses, self._device, **self._columns)
 
 
-def _grid_key(grid: FloatArray) -> tuple[bytes, tuple[int, ...]]:
-    return grid.tobytes(), grid.shape
-
-
-def _stacked(arrays: Sequence[np.ndarray]) -> np.ndarray:
-    """Arrays of unequal lengths, filled up with zeros."""
-    longest = max(len(array) for array in arrays)
-    stacked = np.zeros((len(arrays), longest, *arrays[0].shape[1:]), dtype=arrays[0].dtype)
-    for row, array in zip(stacked, arrays, strict=True):
-        row[: len(array)] = array
-    return stacked
+def padded(array: np.ndarray, shape: Sequence[int]) -> np.ndarray:
+    """Zeros behind the numbers of an array."""
+    whole = np.zeros(shape, dtype=array.dtype)
+    whole[tuple(slice(0, n) for n in array.shape)] = array
+    return whole
 
 
 def trajectory(
-    press: Press, records: FloatArray, ended: tuple[int, float, float], seconds: float, space: Space
+    press: Press, told: Sequence[Record], fields: FloatArray, reason: str, seconds: float, space: Space
 ) -> Trajectory:
     """The trajectory of a press that ran in a lane, `seconds` of the run being its share.
 
-    `records` (r, ...) are what the lane wrote, see `synth.simulate.batched.reductions.write_record`; `ended` is the
-    reason's code, the path length reached, and where the next step would have led, mm.
+    `told` is what its policy recorded and `fields` (r, ...) what the lane wrote, see
+    `synth.simulate.batched.reductions.write_record`.
     """
     states = at_rest(press.path, space)
-    for length, record in zip(press.path.records(), records, strict=False):
-        states.append(_state(press, float(length), record, space))
-    code, reached, target = ended
-    reasons = {
-        COMPLETE: "",
-        NO_EQUILIBRIUM: not_converged(target - reached, press.path.pose(reached)),
-        NO_CONTACT: no_contact(target),
-        TOO_DEEP: too_deep(press.path.pose(target), allowed_share(press.path.body)),
-    }
-    return Trajectory(tuple(states), reasons[code], seconds, space)
+    states += [_state(press, record, row, space) for record, row in zip(told, fields, strict=True)]
+    return Trajectory(tuple(states), reason, seconds, space)
 
 
-def _state(press: Press, length: float, record: FloatArray, space: Space) -> State:
-    pose, modulus_mpa = press.path.pose(length), press.scene.sensor.gel.youngs_modulus_kpa / 1000
-    scalars, fields = record[:SCALARS].tolist(), record[SCALARS:]
+def _state(press: Press, told: Record, row: FloatArray, space: Space) -> State:
+    pose, modulus_mpa = press.path.pose(told.at_mm), press.scene.sensor.gel.youngs_modulus_kpa / 1000
+    scalars, fields = row[:SCALARS].tolist(), row[SCALARS:]
     end = 3 * len(space.points)
     fx, fy, fz, mx, my, mz = (modulus_mpa * value for value in scalars[:6])
-    touching, slipping, residual, smallest, deepest, iterations = scalars[6:]
-    displacement = fields[:end].reshape(-1, 3).copy()
+    touching, slipping = scalars[6:]
     return State(
         depth_mm=pose.depth_mm,
         shear_mm=pose.shear_mm,
         twist_deg=pose.twist_deg,
-        displacement=displacement,
+        displacement=fields[:end].reshape(-1, 3).copy(),
         traction=modulus_mpa * fields[end:].reshape(-1, 3),
         force_n=(fx, fy, fz),
         torque_nmm=(mx, my, mz),
-        newton_iterations=int(iterations),
-        residual=residual,
-        min_jacobian=smallest,
-        max_penetration_mm=deepest,
+        newton_iterations=told.iterations,
+        residual=told.evaluation.relative,
+        min_jacobian=told.evaluation.smallest_jacobian,
+        max_penetration_mm=told.evaluation.deepest_mm,
         slip_ratio=slipping / touching if touching > 0 else 0.0,
     )

@@ -3,15 +3,17 @@
 import warp as wp
 
 from synth.simulate.batched.fields import Fields, node_step
-from synth.simulate.batched.lanes import CORRECTION, Lanes
+from synth.simulate.batched.lanes import NORM, RECORD, SHARE, Order, Seen
 from synth.simulate.contact import Faces, Indenters, position
 
 BLOCK = 256
 """Threads that sum a lane's residual."""
 SLIPS = wp.constant(wp.float64(1.0 - 1.0e-6))
 """Share of the friction limit from which a point counts as slipping, as in `System.slip_ratio`."""
-SCALARS = wp.constant(12)
-"""A record's numbers before its fields: force (3), moment (3), touching and slipping area, what `write_record` adds."""
+SCALARS = wp.constant(8)
+"""A record's numbers before its fields: force (3), moment (3), touching and slipping area."""
+FREE, FORCES, REACTION, JACOBIAN, DEEPEST, MOVED, ERROR, FORCE, DONE, FINITE = (wp.constant(int(n)) for n in Seen)
+TRY = wp.constant(int(Order.TRY))
 
 
 @wp.struct
@@ -31,24 +33,25 @@ def residual_norms(
     jacobian: wp.array2d(dtype=wp.float64),
     node_row: wp.array(dtype=wp.int32),
     fields: Fields,
-    lanes: Lanes,
+    seen: wp.array2d(dtype=wp.float64),
 ):
-    """One block per lane: the trial's norms (free residual, all forces), smallest det F, how far it went in a pass."""
+    """One block per lane: norms of the free residual, all forces and those on held nodes, smallest det F, moved."""
     s, thread = wp.tid()
     if mask[s] == 0:
         return
     free = wp.float64(0.0)
     whole = wp.float64(0.0)
+    held = wp.float64(0.0)
     smallest = wp.float64(1.0e30)
     farthest = wp.float64(0.0)
-    if lanes.stage[s] == CORRECTION:
-        for i in range(thread, force.shape[1], wp.block_dim()):
-            farthest = wp.max(farthest, wp.length_sq(fields.trial_u[s, i] - fields.recorded_u[s, i]))
     for i in range(thread, force.shape[1], wp.block_dim()):
+        farthest = wp.max(farthest, wp.length_sq(fields.trial_u[s, i] - fields.before_pass_u[s, i]))
         square = wp.length_sq(force[s, i])
         whole += square
         if node_row[i] >= 0:
             free += square
+        else:
+            held += square
     for i in range(thread, volume.shape[1], wp.block_dim()):
         free += volume[s, i] * volume[s, i]
     for i in range(thread, jacobian.shape[1], wp.block_dim()):
@@ -57,11 +60,14 @@ def residual_norms(
     whole = wp.tile_extract(wp.tile_sum(wp.tile(whole)), 0)
     smallest = wp.tile_extract(wp.tile_min(wp.tile(smallest)), 0)
     farthest = wp.tile_extract(wp.tile_max(wp.tile(farthest)), 0)
+    held = wp.tile_extract(wp.tile_sum(wp.tile(held)), 0)
     if thread == 0:
-        lanes.trial_norm[s] = wp.sqrt(free)
-        lanes.trial_force[s] = wp.sqrt(whole)
-        lanes.trial_jacobian[s] = smallest
-        lanes.trial_moved[s] = wp.sqrt(farthest)
+        seen[s, FREE] = wp.sqrt(free)
+        seen[s, FORCES] = wp.sqrt(whole)
+        seen[s, REACTION] = wp.sqrt(held)
+        seen[s, JACOBIAN] = smallest
+        seen[s, MOVED] = wp.sqrt(farthest)
+        seen[s, DEEPEST] = wp.float64(0.0)
 
 
 @wp.kernel
@@ -73,47 +79,44 @@ def relaxation_errors(
     node_row: wp.array(dtype=wp.int32),
     pressure_row: wp.array(dtype=wp.int32),
     right: wp.array2d(dtype=wp.float32),
-    lanes: Lanes,
+    orders: wp.array(dtype=wp.int32),
+    numbers: wp.array2d(dtype=wp.float64),
+    seen: wp.array2d(dtype=wp.float64),
 ):
-    """One block per lane: the norm of r(u + t δ) - (1 - t) r(u) + t θ L δ over that of r(u), and what held
-    nodes bear, where a lane relaxes.
+    """One block per lane: the norm of r(u + t δ) - (1 - t) r(u) + t θ L δ over that of r(u), where a lane relaxes.
 
     right: (B, at least rows), first -r(u) over its norm, the linear solve's right side.
     """
     s, thread = wp.tid()
-    if mask[s] == 0 or lanes.relaxing[s] == 0:
+    if mask[s] == 0:
         return
-    held = wp.float64(0.0)
-    left = (wp.float64(1.0) - lanes.part[s]) * lanes.norm[s]
+    part = wp.float64(1.0)
+    if (orders[s] & TRY) != 0:
+        part = numbers[s, SHARE]
+    left = (wp.float64(1.0) - part) * numbers[s, NORM]
     total = wp.float64(0.0)
     for i in range(thread, force.shape[1], wp.block_dim()):
         row = node_row[i]
         if row >= 0:
             total += wp.length_sq(force[s, i] + viscous[s, i] + left * node_step(right, s, row))
-        else:
-            held += wp.length_sq(force[s, i])
     for i in range(thread, volume.shape[1], wp.block_dim()):
         rest = volume[s, i] + left * wp.float64(right[s, pressure_row[i]])
         total += rest * rest
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
-    held = wp.tile_extract(wp.tile_sum(wp.tile(held)), 0)
     if thread == 0:
-        lanes.trial_held_force[s] = wp.sqrt(held)
-        lanes.trial_error[s] = wp.sqrt(total) / lanes.norm[s]
+        seen[s, ERROR] = wp.sqrt(total) / numbers[s, NORM]
 
 
 @wp.kernel
-def clear_sums(mask: wp.array(dtype=wp.int32), lanes: Lanes, values: wp.array2d(dtype=wp.float64)):
-    """One thread per (lane, number): zeros for the sums, and no penetration."""
+def clear_sums(mask: wp.array(dtype=wp.int32), values: wp.array2d(dtype=wp.float64)):
+    """One thread per (lane, number): zeros for the sums."""
     s, i = wp.tid()
-    if mask[s] == 0:
-        return
-    values[s, i] = wp.float64(0.0)
-    lanes.deepest[s] = wp.float64(0.0)
+    if mask[s] == 1:
+        values[s, i] = wp.float64(0.0)
 
 
 @wp.kernel
-def penetrations(mask: wp.array(dtype=wp.int32), gap: wp.array3d(dtype=wp.float64), lanes: Lanes):
+def penetrations(mask: wp.array(dtype=wp.int32), gap: wp.array3d(dtype=wp.float64), seen: wp.array2d(dtype=wp.float64)):
     """One thread per (lane, face): the largest penetration."""
     s, f = wp.tid()
     if mask[s] == 0:
@@ -122,7 +125,7 @@ def penetrations(mask: wp.array(dtype=wp.int32), gap: wp.array3d(dtype=wp.float6
     for q in range(gap.shape[2]):
         deepest = wp.max(deepest, -gap[s, f, q])
     if deepest > wp.float64(0.0):
-        wp.atomic_max(lanes.deepest, s, deepest)
+        wp.atomic_max(seen, s, DEEPEST, deepest)
 
 
 @wp.kernel
@@ -167,9 +170,23 @@ def contact_forces(
 
 
 @wp.kernel
+def press_forces(
+    mask: wp.array(dtype=wp.int32),
+    axes: wp.array(dtype=wp.mat33d),
+    sums: wp.array2d(dtype=wp.float64),
+    seen: wp.array2d(dtype=wp.float64),
+):
+    """The indenter's force along the press."""
+    s = wp.tid()
+    if mask[s] == 1:
+        a = axes[s]
+        seen[s, FORCE] = sums[s, 0] * a[0, 2] + sums[s, 1] * a[1, 2] + sums[s, 2] * a[2, 2]
+
+
+@wp.kernel
 def write_record(
     mask: wp.array(dtype=wp.int32),
-    lanes: Lanes,
+    numbers: wp.array2d(dtype=wp.float64),
     u: wp.array2d(dtype=wp.vec3d),
     sums: wp.array2d(dtype=wp.float64),
     surface: int,
@@ -177,20 +194,16 @@ def write_record(
 ):
     """One thread per (lane, node): a record's scalars and displacement, and zeros for its tractions.
 
-    records: (B, R, SCALARS + 3 n + 3 surface): force, moment, areas, residual, smallest det F, penetration and Newton
-    iterations, then the displacement of all nodes and the traction at the surface's nodes.
+    records: (B, R, SCALARS + 3 n + 3 surface): force, moment, areas, then the displacement of all nodes and the
+    traction at the surface's nodes.
     """
     s, i = wp.tid()
     if mask[s] == 0:
         return
-    r = lanes.records[s]
+    r = int(numbers[s, RECORD])
     if i == 0:
         for k in range(8):
             records[s, r, k] = sums[s, k]
-        records[s, r, 8] = lanes.relative[s]
-        records[s, r, 9] = lanes.jacobian[s]
-        records[s, r, 10] = lanes.deepest[s]
-        records[s, r, 11] = wp.float64(lanes.total[s])
     first = SCALARS + 3 * i
     for k in range(3):
         records[s, r, first + k] = u[s, i][k]
@@ -203,7 +216,7 @@ def write_record(
 @wp.kernel
 def write_tractions(
     mask: wp.array(dtype=wp.int32),
-    lanes: Lanes,
+    numbers: wp.array2d(dtype=wp.float64),
     faces: Faces,
     surface: SurfaceTables,
     traction: wp.array3d(dtype=wp.vec3d),
@@ -214,7 +227,7 @@ def write_tractions(
     s, f = wp.tid()
     if mask[s] == 0 or surface.number[f, 0] < 0:
         return
-    r = lanes.records[s]
+    r = int(numbers[s, RECORD])
     for a in range(surface.number.shape[1]):
         share = wp.vec3d()
         for q in range(surface.hat.shape[0]):

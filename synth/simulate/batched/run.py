@@ -1,137 +1,159 @@
 """Many presses through the lanes of one solver: the entry point, and what the host does."""
 
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from itertools import islice
 
 import numpy as np
-import warp as wp
 
-from synth.arrays import FloatArray
 from synth.press.press import Press
-from synth.simulate.batched import lanes as phases
+from synth.simulate.batched.lane import Lane
+from synth.simulate.batched.lanes import Number
 from synth.simulate.batched.pad import Pad
-from synth.simulate.batched.presses import press_tables, trajectory
+from synth.simulate.batched.presses import trajectory
 from synth.simulate.batched.solver import INNER_ITERATIONS, BatchedSolver
 from synth.simulate.options import STANDARD, SolverOptions
-from synth.simulate.policy.newton import MAX_ITERATIONS
+from synth.simulate.policy.load_steps import LoadSteps
 from synth.simulate.solve import check_shared
 from synth.simulate.trajectory import Trajectory, at_rest
 
+Asked = tuple[Press, frozenset[int] | None]
+"""A press, and the numbers of the states that are wanted of it, else all."""
 MAX_BATCH = 512
+AHEAD = 8
+"""Presses that wait for a lane, at most: more than end in a cycle, and few enough to be made beside its work."""
 OPTIONS = replace(STANDARD, relaxed_tolerance=0.0, forcing=1e-4, closer=1e-3)
 """The scene's tolerance along the whole load path, because friction remembers the path; linear solves and corrections
 so tight that rounding hardly ever decides which equilibrium is found."""
-CYCLES_PER_POLL = 2
-"""Cycles between looks at which lanes have ended: a lane waits for half of them on average."""
 
 
 def simulate_presses(
-    presses: Sequence[Press],
-    pad: Pad,
-    frames: Sequence[frozenset[int]] | None = None,
-    batch: int = MAX_BATCH,
-    options: SolverOptions = OPTIONS,
+    asked: Iterable[Asked], pad: Pad, batch: int = MAX_BATCH, options: SolverOptions = OPTIONS
 ) -> Iterator[tuple[int, Trajectory]]:
     """Simulate presses into pads of one mesh, each as if it were alone; their numbers and trajectories, as they end.
 
-    The presses share the pad's materials and, but for the penalty, its numerics, else InputError; the pad is of
-    `synth.simulate.batched.pad.prepare`. `frames` are the numbers of the states that are wanted, of each press (else
-    ValueError), see `synth.simulate.simulate_press`; at most `batch` trajectories run at a time; `options` hold along
-    the load paths.
+    A press comes with the numbers of the states that are wanted, see `synth.simulate.simulate_press`. The presses share
+    the pad's materials and, but for the penalty, its numerics, else InputError; the pad is of
+    `synth.simulate.batched.pad.prepare`. At most `batch` trajectories run at a time, and an iterator is asked for a few
+    more whenever some have ended, even if it had none the last time. `options` hold along the load paths.
     """
-    if frames is not None and len(frames) != len(presses):
-        raise ValueError(f"{len(frames)} sets of frames for {len(presses)} presses")
-    check_shared([pad.scene, *(press.scene for press in presses)], pad.space.mesh)
-    touching = []
-    for number, press in enumerate(presses):
-        if press.path.may_touch:
-            touching.append(number)
-        else:
-            yield number, Trajectory(tuple(at_rest(press.path, pad.space)), "", 0.0, pad.space)
-    if touching:
-        theirs = None if frames is None else [frames[n] for n in touching]
-        run = Run([presses[n] for n in touching], pad, theirs, min(batch, len(touching)), options)
-        for number, result in run:
-            yield touching[number], result
+    numbered = map(partial(_checked, pad), enumerate(asked))
+    waiting = list(islice(numbered, batch))
+    while waiting:
+        run = Run(waiting, numbered, pad, options)
+        yield from run
+        waiting = [*run.waiting, *islice(numbered, batch - len(run.waiting))]
+
+
+def _checked(pad: Pad, numbered: tuple[int, Asked]) -> tuple[int, Asked]:
+    check_shared([pad.scene, numbered[1][0].scene], pad.space.mesh)
+    return numbered
 
 
 class Run:
-    """An iterator over (number of the press, trajectory) in the order in which they end.
+    """Presses, by their numbers, in the lanes of a solver: the first ones, as many as there are lanes, and then more.
 
-    Arguments as of `simulate_presses`, of presses whose indenters touch; `order` are the numbers of the presses in
-    which they begin, by default each once, and `inner` the Krylov iterations of a cycle.
+    The first ones say how many states a lane can record, and how large a distance grid can be. `waiting` are presses
+    that have not begun; if one needs more room, the run ends with it still waiting.
     """
 
     def __init__(
         self,
-        presses: Sequence[Press],
+        first: Sequence[tuple[int, Asked]],
+        more: Iterator[tuple[int, Asked]],
         pad: Pad,
-        frames: Sequence[frozenset[int]] | None,
-        batch: int,
         options: SolverOptions,
-        order: Iterable[int] | None = None,
         inner: int = INNER_ITERATIONS,
     ) -> None:
-        self._presses, self._pad, numerics = presses, pad, presses[0].scene.numerics
-        table, grid = press_tables(presses, frames, pad.device)
-        settings = phases.Settings()
-        settings.tolerance, settings.relaxed_tolerance = numerics.tolerance, options.relaxed_tolerance
-        settings.longest, settings.extrapolate = numerics.max_step_mm, int(options.extrapolate)
-        settings.forcing, settings.closer = options.forcing, options.closer
-        settings.limit, settings.correction_limit = MAX_ITERATIONS, options.correction_iterations
-        records = max(len(press.path.records()) for press in presses)
-        self.solver = BatchedSolver(pad, table, batch, records, grid, settings, inner)
-        self._order = range(len(presses)) if order is None else order
-        self._graph: Any = None
+        self._more, self._pad, self._options = more, pad, options
+        self.waiting = deque(first)
+        batch = len(first)
+        self._room = tuple(np.max([_room(press) for _, (press, _) in first], axis=0).tolist())
+        records, *grid = self._room
+        self.solver = BatchedSolver(pad, batch, records, (grid[0], grid[1], grid[2]), inner)
+        self._orders = np.zeros(batch, dtype=np.int32)
+        self._numbers = np.zeros((batch, len(Number)))
+        self._presses: list[Press] = [press for _, (press, _) in first]
+        self.lanes: list[Lane | None] = [None] * batch
         self.cycles = 0
-        self._spent = 0.0
+        self._untouched: list[tuple[int, Trajectory]] = []
 
     def __iter__(self) -> Iterator[tuple[int, Trajectory]]:
-        """Run all presses. Results are made and handed over while the device works on the next cycles."""
-        batch = self.solver.batch
-        working = np.full(batch, -1)
-        begun = np.zeros(batch)
-        waiting = iter(self._order)
-        empty = np.arange(batch)
-        fetched: list[tuple[int, FloatArray, tuple[int, float, float], float]] = []
+        """Run all presses."""
+        begun, spent = np.zeros(self.solver.batch), 0.0
         while True:
-            assignment = np.full(batch, -1)
-            for lane in empty:
-                working[lane] = assignment[lane] = next(waiting, -2)
             began = time.perf_counter()
-            begun[empty] = self._spent
-            if len(empty):
-                self.solver.fill(assignment)
-            ongoing = bool((working >= 0).any())
-            if ongoing:
-                for _ in range(CYCLES_PER_POLL):
-                    self.advance()
-            self._spent += time.perf_counter() - began  # without what whoever takes the results does meanwhile
-            for number, records, end, seconds in fetched:
-                yield number, trajectory(self._presses[number], records, end, seconds, self._pad.space)
-            if not ongoing:
+            begun[self._fill()] = spent
+            untouched, self._untouched = self._untouched, []
+            yield from untouched
+            if not any(self.lanes):
                 return
-            began = time.perf_counter()
-            empty = np.flatnonzero(self.solver.lanes.phase.numpy() == phases.ENDED)
-            self._spent += time.perf_counter() - began
-            fetched = [
-                (int(working[s]), records, end, float(self._spent - begun[s]) / batch)
-                for s, records, end in self.solver.ended(empty)
-            ]
+            ended = self.advance()
+            over = [(s, lane, self.solver.recorded(s, len(lane.records))) for s, lane in ended]
+            spent += time.perf_counter() - began  # without what whoever takes the results does meanwhile
+            for s, lane, fields in over:
+                self.lanes[s] = None
+                seconds = float(spent - begun[s]) / self.solver.batch
+                result = trajectory(self._presses[s], lane.records, fields, lane.reason, seconds, self._pad.space)
+                yield lane.press, result
 
-    def advance(self) -> None:
-        """One cycle; on CUDA a graph that is captured the second time, when all kernels are loaded."""
+    def advance(self) -> list[tuple[int, Lane]]:
+        """One cycle, and what the lanes are told to do in the next; the lanes that have ended, with their numbers."""
+        self.solver.begin_cycle(self._orders, self._numbers)
+        if len(self.waiting) < min(AHEAD, self.solver.batch):  # while a GPU is at work
+            self.waiting += islice(self._more, 1)
+        seen = self.solver.seen().tolist()
         self.cycles += 1
-        device = wp.get_device(self._pad.device)
-        if not device.is_cuda or self.cycles == 1:
-            self.solver.cycle()
-            return
-        if self._graph is None:
-            # Relaxed: the garbage collector may free a renderer's memory in this thread meanwhile.
-            mode = wp.CaptureMode.RELAXED
-            with wp.ScopedCapture(device=device, force_module_load=False, capture_mode=mode) as capture:
-                self.solver.cycle()
-            self._graph = capture.graph
-        wp.capture_launch(self._graph)
+        working = [(s, lane) for s, lane in enumerate(self.lanes) if lane is not None]
+        ended = [(s, lane) for s, lane in working if lane.ended]
+        for s, lane in working:  # a lane that ends now still has orders for the next cycle
+            self._orders[s] = 0 if lane.ended else lane.advance(seen[s])
+        return ended
+
+    def _fill(self) -> list[int]:
+        """Begin presses in empty lanes; these lanes."""
+        begun: dict[int, Press] = {}
+        for s in (s for s, lane in enumerate(self.lanes) if lane is None):
+            asked = self._next()
+            if asked is None:
+                break
+            number, (press, frames) = asked
+            lane = Lane(number, self._steps(press, frames), self._numbers[s], self._options.forcing)
+            begun[s], self.lanes[s], self._orders[s], self._presses[s] = press, lane, lane.first, press
+        if begun:
+            self.solver.fill(begun)
+        return list(begun)
+
+    def _next(self) -> tuple[int, Asked] | None:
+        """The next press that touches the gel, if there is room for it; those that do not are over at once."""
+        while True:
+            self.waiting += islice(self._more, 0 if self.waiting else 1)
+            if not self.waiting:
+                return None
+            number, (press, _) = self.waiting[0]
+            if press.path.may_touch:
+                fits = all(needs <= there for needs, there in zip(_room(press), self._room, strict=True))
+                return self.waiting.popleft() if fits else None
+            self.waiting.popleft()
+            rest = tuple(at_rest(press.path, self._pad.space))
+            self._untouched.append((number, Trajectory(rest, "", 0.0, self._pad.space)))
+
+    def _steps(self, press: Press, wanted: frozenset[int] | None) -> LoadSteps:
+        scene, mesh = press.scene, press.mesh
+        return LoadSteps(
+            press.path,
+            mesh.size_mm,
+            scene.contact.friction > 0,
+            scene.numerics,
+            self._options,
+            wanted,
+            self._options.closer,
+        )
+
+
+def _room(press: Press) -> tuple[int, ...]:
+    """States that a press records, and the counts of its distance grid."""
+    return len(press.path.records()), *press.path.body.coefficients.shape

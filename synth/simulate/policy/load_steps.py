@@ -49,6 +49,7 @@ class LoadSteps:
         numerics: Numerics,
         options: SolverOptions,
         frames: frozenset[int] | None = None,
+        closer: float = 1.0,
     ) -> None:
         """For a gel of a size, with friction if it `rubs`; frames: numbers of the states that are wanted, default all.
 
@@ -56,7 +57,7 @@ class LoadSteps:
         """
         self._path, self._size_mm, self._rubs, self._numerics, self._options = path, size_mm, rubs, numerics, options
         self._relaxed_tolerance = max(options.relaxed_tolerance, numerics.tolerance)
-        self._passes = Passes(path, numerics.tolerance, self._relaxed_tolerance, options.correction_iterations)
+        self._passes = Passes(path, numerics.tolerance, self._relaxed_tolerance, options.correction_iterations, closer)
         self._waypoints = path.waypoints().tolist()
         records = path.records().tolist()
         self._recorded = frozenset(records)

@@ -56,6 +56,7 @@ class Passes:
     tolerance: float
     relaxed_tolerance: float
     limit: int
+    closer: float = 1.0
 
     def run(self, solution: Solution) -> Asking[Solution]:
         """Passes by whole updates, or as large a share of them as converges; the iterations of all are counted.
@@ -78,7 +79,9 @@ class Passes:
             stiffer = min(2 * stiffening, MAX_STIFFENING) if deep and done > 0 else stiffening
             yield Do.KEEP_PASS
             start = yield Augment(share, stiffer)
-            tolerance = between if deep or done + share < MAX_MULTIPLIER_UPDATES else self.tolerance
+            tolerance = (
+                between if deep or done + share < MAX_MULTIPLIER_UPDATES else max(self.closer * self.tolerance, 1e-12)
+            )
             better = yield from solve(start, tolerance, self.limit, MAX_CORRECTION_RATIO * deepest)
             if not better.converged and deep and share < MAX_RELAXED_UPDATE:
                 start = yield Do.REPEAT
