@@ -90,7 +90,7 @@ def test_every_module_has_a_stage_and_imports_only_from_earlier_ones() -> None:
 
 ROOMS = (
     "errors", "arrays", "untrusted", "hardware", "terminal", "config", "files", "ops", "models", "losses", "data",
-    "fast", "baselines", "track", "predict", "compare", "training", "cli", "__main__",
+    "fast", "methods", "baselines", "track", "predict", "compare", "training", "cli", "__main__",
 )  # fmt: skip
 """The same for the parts of gelflow."""
 
@@ -135,7 +135,7 @@ def test_prediction_loads_nothing_of_training_simulate_no_renderer_and_preview_n
     tmp_path: Path, monkeypatch
 ) -> None:
     code = """
-import gelflow.predict.prediction, gelflow.baselines.learned, gelflow.compare.run, sys
+import gelflow.predict.prediction, gelflow.methods.learned, gelflow.compare.run, sys
 from gelflow.models.weights import load_weights, weights_file
 load_weights(weights_file(None))
 print(*sys.modules)"""
