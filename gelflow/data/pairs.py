@@ -108,9 +108,8 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
         images, record = self.images(index), self.records[index]
         size = images[0].shape[:2]
         image1, image2 = (_channels_first(image) for image in images)
-        sample: dict[str, Tensor | str | bool] = {
-            "image1": image1, "image2": image2, "name": record.name, "bare": record.bare
-        }  # fmt: skip
+        bare = record.scene is not None and record.scene.bare
+        sample: dict[str, Tensor | str | bool] = {"image1": image1, "image2": image2, "name": record.name, "bare": bare}
         if not self.has_flow:
             return sample
         truth = self.truth(index)

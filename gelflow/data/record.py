@@ -7,7 +7,7 @@ from gelflow.data.member import FlowMembers, Member
 from gelflow.files.exr import Direction
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True)
 class PatternedScene:
     """A scene's name and the kind of its gel's pattern; its text is "gelsight_mini, dots"."""
 
@@ -45,8 +45,3 @@ class PairRecord:
     scene: PatternedScene | None = None
     origin: str | None = None
     direction: Direction = "forward"
-
-    @property
-    def bare(self) -> bool:
-        """Whether the pair is synthetic and its gel has no pattern."""
-        return self.scene is not None and self.scene.bare

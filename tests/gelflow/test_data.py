@@ -158,7 +158,7 @@ def test_digest_tells_scene_and_seed_and_flow_of_another_size_is_named(tmp_path:
     assert digests[-1] == hashlib.sha256(known.encode()).hexdigest()
     scene = {"name": "toy", "sensor": {"pattern": {"kind": "none"}}}
     (folder / "dataset.json").write_text(json.dumps({"schema_version": 1, "scene": scene}))
-    assert PairDataset(folder).records[0].bare
+    assert PairDataset(folder)[0]["bare"] is True
     known = json.dumps([["000000", "toy, none", None]])
     assert PairDataset(folder).digest == hashlib.sha256(known.encode()).hexdigest()
     write_flow(folder / "samples" / "000000" / "flow.exr", np.zeros((10, 10, 2), np.float32))
