@@ -103,6 +103,17 @@ def test_gelflow_imports_only_from_earlier_parts() -> None:
     assert {imported for _, imported in parts} == set(ROOMS[:-1]), "a finder that sees nothing would pass always"
 
 
+def test_networks_need_no_baseline_baselines_no_weights_and_the_writer_no_kind_of_store() -> None:
+    gelflow, synth = _imports_of(GELFLOW), _imports_of(SYNTH)
+    ours = ("gelflow.methods", "gelflow.predict", "gelflow.track")
+    assert [pair for pair in gelflow if pair[0].startswith(ours) and pair[1].startswith("gelflow.baselines")] == []
+    weights = ("gelflow.methods.learned", "gelflow.models.weights", "gelflow.models.raft")
+    assert [pair for pair in gelflow if pair[0].startswith("gelflow.baselines") and pair[1].startswith(weights)] == []
+    kinds = {f"synth.dataset.store.{name}Store" for name in ("Directory", "Remote")} | {"synth.dataset.objects"}
+    askers = {name for name, imported in synth if imported in kinds}
+    assert askers == {"synth.dataset.store", "synth.dataset.lines", "synth.dataset.lock"}
+
+
 @pytest.mark.parametrize(("modules", "forbidden"), [
     (SYNTH, {"gelflow", "benchmarks", "torch", "lightning", "torchmetrics"}),
     (GELFLOW, {"synth", "benchmarks", "warp", "mitsuba", "drjit", "pytetwild", "pypardiso", "pyvista"}),
