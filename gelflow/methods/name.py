@@ -10,28 +10,28 @@ class MethodName:
 
     Attributes:
         label: What it is called.
-        registration: Which registration is added to it, one of `gelflow.config.REGISTRATIONS`, or "".
-        seed: Which of several trainings it is that differ in nothing but their seed; None where there is one.
+        registration: What registers its flow, of `gelflow.config.REGISTRATIONS`, "registration" for another, or "".
+        seed: Number of a training among several that differ in nothing but their seed, as it was given, or "".
         fine_tuned: Whether it was optimised on the very pairs that it is scored on.
     """
 
     label: str
     registration: str = ""
-    seed: int | None = None
+    seed: str = ""
     fine_tuned: bool = False
 
     @classmethod
     def parse(cls, text: str) -> "MethodName":
         """The name that a user gave: LABEL, LABEL#SEED, LABEL+ft or LABEL#SEED+ft."""
         ((label, seed, tuned),) = re.findall(r"(?s)^(.*?)(?:#(\d+))?(\+ft)?\Z", text)
-        return cls(label, seed=int(seed) if seed else None, fine_tuned=bool(tuned))
+        return cls(label, seed=seed, fine_tuned=bool(tuned))
 
     @property
     def group(self) -> "MethodName":
         """The name without its seed."""
-        return replace(self, seed=None)
+        return replace(self, seed="")
 
     def __str__(self) -> str:
-        seed = "" if self.seed is None else f"#{self.seed}"
         added = self.registration and f"+{self.registration}"
+        seed = self.seed and f"#{self.seed}"
         return f"{self.label}{added}{seed}{'+ft' if self.fine_tuned else ''}"

@@ -29,8 +29,9 @@ PITCH = 24.0
 
 def test_seeds_become_mean_and_standard_deviation(tmp_path: Path) -> None:
     named = {"best#0": "best", "best#12+ft": "best+ft", "best": "best",
-              "C# code": "C# code", "a#1b": "a#1b", "x#2#3": "x#2"}  # fmt: skip
+              "C# code": "C# code", "a#007": "a", "a#1b": "a#1b", "x#2#3": "x#2"}  # fmt: skip
     assert {text: str(MethodName.parse(text).group) for text in named} == named
+    assert [str(MethodName.parse(text)) for text in named] == list(named)
     dataset = PairDataset(write_synthetic(tmp_path, [(1.0, 0.0), (2.0, 0.0)]))
     methods = [Constant("net#0", 0, 0), Constant("other", 5, 0), Constant("net#1", 0.5, 0), Constant("net#2", 1, 0)]
     scores = [score for method in methods for score in evaluate(method, dataset)]
