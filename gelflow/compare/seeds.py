@@ -7,12 +7,9 @@ sample's (n - 1).
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
-from typing import TYPE_CHECKING
 
+from gelflow.compare.scores import MethodScore
 from gelflow.methods.name import MethodName
-
-if TYPE_CHECKING:
-    from gelflow.compare.scores import MethodScore
 
 
 @dataclass(frozen=True)
@@ -20,7 +17,7 @@ class Group:
     """Scores of one training, or of several with different seeds."""
 
     name: MethodName
-    members: "tuple[MethodScore, ...]"
+    members: tuple[MethodScore, ...]
 
     @property
     def label(self) -> str:
@@ -42,7 +39,7 @@ class Group:
         return None if len(values) < 2 or any(value is None for value in values) else stdev(values)
 
 
-def grouped(means: "Sequence[MethodScore]") -> list[Group]:
+def grouped(means: Sequence[MethodScore]) -> list[Group]:
     """Groups in the order in which their first members appear."""
     names = dict.fromkeys(score.method.group for score in means)
     return [Group(name, tuple(s for s in means if s.method.group == name)) for name in names]
