@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.pressed_gel import View
-from gelflow.baselines.method import Method
+from gelflow.methods.method import Method
 from synth.arrays import BoolArray, FloatArray, Image
 from synth.errors import InputError
 from synth.flow.exact import exact_flow

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from benchmarks.rows import Row, arguments, machine, plot, show, write
 from gelflow.baselines import named_methods
-from gelflow.baselines.learned import Learned, open_network
-from gelflow.baselines.method import uncertainty
 from gelflow.compare.metrics import endpoint_error
 from gelflow.data.open import open_all
-from gelflow.fast.method import Fast
+from gelflow.methods.fast import Fast
+from gelflow.methods.learned import Learned, open_network
+from gelflow.methods.method import uncertainty
 from gelflow.models.weights import weights_file
 
 CLASSICAL = ["dis-ultrafast", "dis-fast", "dis-medium", "farneback", "lucas-kanade", "tvl1"]
@@ -42,7 +42,7 @@ def main(argv: list[str]) -> int:
     given = parser.parse_args(argv)
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
-    methods: dict[str, Any] = {method.name: method for method in named_methods(CLASSICAL, "cpu")}
+    methods: dict[str, Any] = {str(method.name): method for method in named_methods(CLASSICAL, "cpu")}
     methods |= {"fast": Fast(), "network": Learned(weights_file(None), None, None, "cpu", "none")}
     methods["best"] = open_network(weights_file(None), device="cpu")
     found: dict[tuple[str, str], list[tuple[float, float, float]]] = defaultdict(list)

@@ -17,9 +17,10 @@ from typing import Any
 
 from benchmarks.rows import Row, arguments, measure, show
 from gelflow.baselines import named_methods
-from gelflow.baselines.learned import Learned, open_network
 from gelflow.compare.scores import evaluate
 from gelflow.data import PairDataset, open_all
+from gelflow.methods.learned import Learned, open_network
+from gelflow.methods.name import MethodName
 from synth.cli import main as synth
 
 SCENES, PAIRS, SEED = ("gelsight_mini", "deltact", "gelslim", "soft_bubble", "tac3d"), 6, 58
@@ -138,11 +139,11 @@ def _method(name: str, seed: int | None, dataset: PairDataset, given: Any) -> An
     if name in CLASSICAL:
         return named_methods([CLASSICAL[name]], given.device)[0]
     if name == "RAFT":
-        return open_network(given.raft, name, device=given.device)
+        return open_network(given.raft, MethodName(name), device=given.device)
     from gelflow.training.test_time import fine_tuned
 
     folder = _folder(given.runs, FINE_TUNED.get(name, name), seed)
-    network = open_network(folder / "weights.safetensors", name, device=given.device, registration="none")
+    network = open_network(folder / "weights.safetensors", MethodName(name), device=given.device, registration="none")
     if not isinstance(network, Learned):
         raise TypeError(f"{folder} holds other weights than GelFlow's")
     return fine_tuned(network, dataset, folder / "ft", FT_STEPS) if name in FINE_TUNED else network

@@ -58,11 +58,11 @@ def bare_gel(folder: Path, pairs: list[int], out: Path) -> None:
     """Two images and three flows of each pair."""
     from PIL import Image
 
-    from gelflow.baselines.learned import open_network
     from gelflow.baselines.registry import named_methods
     from gelflow.data.open import open_all
     from gelflow.errors import InputError
     from gelflow.files.image import to_bytes
+    from gelflow.methods.learned import open_network
     from gelflow.models.weights import weights_file
     from gelflow.predict.pictures import flow_to_colour
 

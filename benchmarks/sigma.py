@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.rows import Row, arguments, show
-from gelflow.baselines.method import as_array, as_tensor
 from gelflow.compare.metrics import endpoint_error
 from gelflow.data.open import open_all
-from gelflow.data.pairs import PairDataset, without_pattern
+from gelflow.data.pairs import PairDataset
+from gelflow.data.record import PatternedScene
+from gelflow.methods.method import as_array, as_tensor
 from gelflow.models.evidence import evidence, step
 from gelflow.models.uncertainty import CURVATURE, combined, error_squares
 from gelflow.models.working_size import sized_sigma, working_sizes
@@ -32,14 +33,14 @@ WINDOW_PX, BACKGROUND_PX = 5.0, 4.0
 EVERY = 7
 """Every so many-th pixel counts; neighbours hardly differ."""
 CURVATURES = (0.0, 0.1, 0.14, 0.17, 0.2, 0.24, 0.28, 0.4)
-Scenes = Mapping[str, NDArray[np.float64]]
+Scenes = Mapping[PatternedScene | None, NDArray[np.float64]]
 """By scene and pattern: sigma with each of CURVATURES, the bound's square, and endpoint error; (10, N)."""
 
 
 def pixels(dataset: PairDataset, folder: Path) -> Scenes:
     """The errors of the shipped network's flow and its sigmas."""
     model = load_model()
-    found: dict[str, list[NDArray[np.float64]]] = {}
+    found: dict[PatternedScene | None, list[NDArray[np.float64]]] = {}
     folder.mkdir(parents=True, exist_ok=True)
     for index, record in enumerate(dataset.records):
         image1, image2 = dataset.images(index)
@@ -61,7 +62,7 @@ def pixels(dataset: PairDataset, folder: Path) -> Scenes:
         values = [combined(*squares, factor)[0, 0].double().numpy() for factor in CURVATURES]
         bound = step(evidence(true.nan_to_num(), first, SplineImage(second).at, BACKGROUND_PX), WINDOW_PX).variance
         values += [bound[0, 0].double().numpy(), error]
-        found.setdefault(str(record.scene), []).append(np.stack([value[counts][::EVERY] for value in values]))
+        found.setdefault(record.scene, []).append(np.stack([value[counts][::EVERY] for value in values]))
         print(f"{len(found)} scenes, pair {index + 1} of {len(dataset)}", flush=True)
     return {scene: np.concatenate(parts, axis=1) for scene, parts in found.items()}
 
@@ -89,11 +90,11 @@ def main(argv: list[str]) -> int:
     parser.add_argument("data", nargs="+", type=Path)
     given = parser.parse_args(argv)
     scenes = pixels(open_all(given.data), given.out / "sigma")
-    curvature = fitted({name: part for name, part in scenes.items() if not without_pattern(name)})
+    curvature = fitted({name: part for name, part in scenes.items() if name is None or not name.bare})
     print(f"fitted: CURVATURE {curvature:g}; as it stands: {CURVATURE:g}")
     rows: list[Row] = []
-    for name, part in sorted(scenes.items()):
-        row: Row = {"scene": name, "pixels": part.shape[1]}
+    for name, part in sorted(scenes.items(), key=lambda item: str(item[0])):
+        row: Row = {"scene": str(name), "pixels": part.shape[1]}
         for low, high in ((0.0, 0.1), (0.1, 1.0)):
             share, right = hits(part, CURVATURE, low, high)
             row |= {f"sigma <= {high:g} px %": 100 * share, f"of these right % ({high:g})": 100 * right}

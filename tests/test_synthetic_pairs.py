@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 from torch import Tensor
 
-from gelflow.baselines.learned import Learned
 from gelflow.compare.scores import evaluate
 from gelflow.config import LossConfig
 from gelflow.config.sources import train_config
 from gelflow.data import PairDataset
 from gelflow.losses import self_supervised_loss
+from gelflow.methods.learned import Learned
 from gelflow.models.weights import weights_file
 from gelflow.ops.pyramid import flow_pyramid
 from synth.pipeline.generate import generate

@@ -1,6 +1,5 @@
-"""Methods that estimate the flow of a pair, behind one interface."""
+"""Methods without weights that this project's are compared with."""
 
-from gelflow.baselines.method import Method
 from gelflow.baselines.registry import CLASSICAL, named_methods
 
-__all__ = ["CLASSICAL", "Method", "named_methods"]
+__all__ = ["CLASSICAL", "named_methods"]

@@ -1,7 +1,7 @@
 """Augmented-Lagrangian digital image correlation: pyALDIC (PyPI al-dic, BSD-3), the accuracy to beat.
 
 Windows of 32 px, a node every 8 px, its defaults otherwise; float64 luma. Nodes that it could not track are dropped,
-the others interpolated as in `gelflow.baselines.method`, which also fills the margin of half a window that has no
+the others interpolated as in `gelflow.baselines.scattered`, which also fills the margin of half a window that has no
 nodes. The first call compiles its code, which takes minutes.
 
 It is optional and not a requirement of this package: it asks for a graphical toolkit and for a build of OpenCV that
@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from gelflow.arrays import FlowArray, ImageArray
-from gelflow.baselines.method import dense_flow
+from gelflow.baselines.scattered import dense_flow
 from gelflow.errors import InputError
 from gelflow.files.image import check_images
+from gelflow.methods.name import MethodName
 
 INSTALL = "pip install --no-deps al-dic && pip install numba imageio"
 LUMA = np.array([0.299, 0.587, 0.114])
@@ -28,7 +29,7 @@ MINIMUM_SIDE = 64
 class ALDIC:
     """pyALDIC with windows of 32 px and a node every 8 px."""
 
-    name = "pyALDIC"
+    name = MethodName("pyALDIC")
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
         """See `Method.flow`; InputError also where pyALDIC is not installed, or could not solve this pair."""

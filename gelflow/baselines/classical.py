@@ -15,11 +15,12 @@ import cv2
 import numpy as np
 
 from gelflow.arrays import FlowArray, Grey8, ImageArray
-from gelflow.baselines.method import as_array, as_tensor
 from gelflow.config import RegistrationConfig
 from gelflow.errors import InputError
 from gelflow.fast import start
 from gelflow.files.image import check_images, to_grey
+from gelflow.methods.method import as_array, as_tensor
+from gelflow.methods.name import MethodName
 from gelflow.models.registration import registered
 
 
@@ -27,7 +28,7 @@ from gelflow.models.registration import registered
 class Classical:
     """A method that estimates the flow (H, W, 2) of two grey images."""
 
-    name: str
+    name: MethodName
     estimate: Callable[[Grey8, Grey8], Any]
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
@@ -42,7 +43,7 @@ class Classical:
 
 def dis(preset: Literal["ultrafast", "fast", "medium"]) -> Classical:
     """Dense inverse search with one of OpenCV's presets."""
-    return Classical(f"DIS {preset}", partial(start.dis, preset))
+    return Classical(MethodName(f"DIS {preset}"), partial(start.dis, preset))
 
 
 def _still(grey1: Grey8, grey2: Grey8) -> FlowArray:
@@ -63,10 +64,10 @@ def _tvl1(grey1: Grey8, grey2: Grey8) -> Any:
     return cv2.optflow.DualTVL1OpticalFlow.create().calc(grey1, grey2, None)
 
 
-NO_MOTION = Classical("no motion", _still)
+NO_MOTION = Classical(MethodName("no motion"), _still)
 """Says that nothing moved: what every method has to beat."""
-FARNEBACK = Classical("Farnebäck", _farneback)
-TVL1 = Classical("TV-L1", _tvl1)
+FARNEBACK = Classical(MethodName("Farnebäck"), _farneback)
+TVL1 = Classical(MethodName("TV-L1"), _tvl1)
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,8 @@ class RegisteredDIS:
     device: str = "cpu"
 
     @property
-    def name(self) -> str:
-        return f"DIS medium+{self.aim}"
+    def name(self) -> MethodName:
+        return MethodName("DIS medium", registration=self.aim)
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
         """See `Method.flow`."""

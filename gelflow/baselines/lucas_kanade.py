@@ -2,16 +2,17 @@
 
 Corners of Shi and Tomasi (at most 2000, at least 5 px apart, of 1 % or more of the best corner's quality) are tracked
 by OpenCV with windows of 21 px over 5 octaves, there and back. Points that do not come back to within 0.5 px are
-dropped; the others are interpolated as in `gelflow.baselines.method`. 8-bit luma.
+dropped; the others are interpolated as in `gelflow.baselines.scattered`. 8-bit luma.
 """
 
 import cv2
 import numpy as np
 
 from gelflow.arrays import FlowArray, ImageArray
-from gelflow.baselines.method import dense_flow
+from gelflow.baselines.scattered import dense_flow
 from gelflow.errors import NothingFoundError
 from gelflow.files.image import check_images, to_grey
+from gelflow.methods.name import MethodName
 
 CORNERS, QUALITY, DISTANCE_PX = 2000, 0.01, 5.0
 WINDOW_PX, OCTAVES = 21, 4
@@ -22,7 +23,7 @@ CLOSURE_PX = 0.5
 class LucasKanade:
     """Tracks corners and interpolates their motion."""
 
-    name = "Lucas-Kanade"
+    name = MethodName("Lucas-Kanade")
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
         """See `Method.flow`.

@@ -4,11 +4,12 @@ from collections.abc import Sequence
 
 from gelflow.baselines.aldic import ALDIC
 from gelflow.baselines.classical import FARNEBACK, NO_MOTION, TVL1, RegisteredDIS, dis
+from gelflow.baselines.exact import ExactFlow
 from gelflow.baselines.lucas_kanade import LucasKanade
-from gelflow.baselines.method import ExactFlow, Method
 from gelflow.config import REGISTRATIONS
 from gelflow.errors import InputError
 from gelflow.hardware import chosen_device
+from gelflow.methods.method import Method
 
 CLASSICAL: dict[str, Method] = {
     "none": NO_MOTION,

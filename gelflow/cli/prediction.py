@@ -32,7 +32,7 @@ from gelflow.cli.options import (
 from gelflow.errors import InputError, printable
 
 if TYPE_CHECKING:
-    from gelflow.baselines import Method
+    from gelflow.methods.method import Method
     from gelflow.predict.live import LiveFlow
     from gelflow.predict.page import Page
     from gelflow.predict.prediction import Motion, Prediction
@@ -94,7 +94,7 @@ def predict(
     if result.lost:
         words = f"about {result.lost} frames at its end do not decode (truncated or damaged)"
         print(f"gelflow: {inputs[0]}: {words}", file=sys.stderr)
-    _show(result, estimator.name, as_json)
+    _show(result, str(estimator.name), as_json)
     return 0
 
 
@@ -195,7 +195,7 @@ def _estimator(
 ) -> Method:
     """The network or classical method that the options name."""
     from gelflow.baselines import named_methods
-    from gelflow.baselines.learned import open_network
+    from gelflow.methods.learned import open_network
     from gelflow.models.weights import weights_file
 
     if method is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,10 +24,10 @@ from gelflow.cli.options import (
 from gelflow.errors import InputError
 
 if TYPE_CHECKING:
-    from gelflow.baselines import Method
-    from gelflow.baselines.learned import Learned, PublishedRaft
     from gelflow.data import PairDataset
-    from gelflow.fast.method import Fast
+    from gelflow.methods.fast import Fast
+    from gelflow.methods.learned import Learned, PublishedRaft
+    from gelflow.methods.method import Method
 
 
 def evaluate(
@@ -40,8 +41,8 @@ def evaluate(
     as_json: AsJson = False,
 ) -> int:
     """Scores one file of weights on image pairs."""
-    from gelflow.baselines.learned import open_network
     from gelflow.data import open_all
+    from gelflow.methods.learned import open_network
     from gelflow.models.weights import weights_file
 
     network = open_network(weights_file(weights), None, parse_size(size), device, registration)
@@ -94,8 +95,8 @@ def compare(
 ) -> int:
     """Scores several methods on the same image pairs."""
     from gelflow.baselines import named_methods
-    from gelflow.baselines.learned import Learned
     from gelflow.data import PairDataset, open_all
+    from gelflow.methods.learned import Learned
 
     chosen = named_methods([name.strip() for name in methods.split(",") if name.strip()], device)
     networks = [network for given in weights or () for network in _networks(given, registration, size, device)]
@@ -112,7 +113,9 @@ def compare(
         if out is None or not own:
             raise InputError(f"--ft {ft}: needs --weights of GelFlow, and --out beside which their copies are kept")
         folder = out.with_name(f"{out.name}_ft")
-        networks += [fine_tuned(one, dataset, folder / one.label.replace("/", "_"), ft) for one in own]
+        for one in own:
+            label = str(replace(one.name, registration="")).replace("/", "_")
+            networks.append(fine_tuned(one, dataset, folder / label, ft))
     _score(dataset, [*chosen, *networks], out, as_json, batch)
     return 0
 
@@ -121,12 +124,14 @@ def _networks(
     given: str, registrations: Sequence[Registered] | None, size: str | None, device: str
 ) -> list[Learned | PublishedRaft | Fast]:
     """The rows of one --weights: of GelFlow one for each --registration, of RAFT, which it does not concern, one."""
-    from gelflow.baselines.learned import open_network
+    from gelflow.methods.learned import open_network
+    from gelflow.methods.name import MethodName
     from gelflow.models.raft import looks_like_raft
     from gelflow.models.weights import weights_file
 
     label, equals, file = given.partition("=")
-    path, name = weights_file(Path(file if equals else given)), label if equals else None
+    path = weights_file(Path(file if equals else given))
+    name = MethodName.parse(label) if equals else None
     choices = (None,) if not registrations or looks_like_raft(path) else tuple(registrations)
     return [open_network(path, name, parse_size(size), device, choice) for choice in choices]
 

@@ -6,12 +6,13 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from gelflow.compare.scores import PairScore, summarise
 from gelflow.compare.speed import Speed
 from gelflow.compare.strata import Stratum, merged
+from gelflow.methods.name import MethodName
 
 
 @dataclass(frozen=True)
@@ -23,8 +24,8 @@ class Comparison:
 
     data: tuple[str, ...]
     scores: tuple[PairScore, ...]
-    strata: Mapping[str, Sequence[Stratum]]
-    speeds: Mapping[str, Speed]
+    strata: Mapping[MethodName, Sequence[Stratum]]
+    speeds: Mapping[MethodName, Speed]
 
     @property
     def pairs(self) -> list[str]:
@@ -45,12 +46,12 @@ class Comparison:
         """JSON; numbers that are not finite (PSNR of equal images, errors of an estimate with gaps) become null."""
         answer = {
             "data": list(self.data),
-            "methods": [_plain(asdict(score)) for score in summarise(self.scores)],
-            "scores": [_plain({k: v for k, v in asdict(score).items() if k != "strata"}) for score in self.scores],
-            "strata": {name: [_plain(asdict(one)) for one in bins] for name, bins in self.strata.items()},
-            "networks": {name: asdict(speed) for name, speed in self.speeds.items()},
+            "methods": [_plain(vars(score)) for score in summarise(self.scores)],
+            "scores": [_plain({k: v for k, v in vars(score).items() if k != "strata"}) for score in self.scores],
+            "strata": {str(name): [_plain(vars(one)) for one in bins] for name, bins in self.strata.items()},
+            "networks": {str(name): vars(speed) for name, speed in self.speeds.items()},
         }
-        return json.dumps(answer, indent=1)
+        return json.dumps(answer, indent=1, default=str)  # names and scenes as their text
 
 
 def _plain(record: dict[str, Any]) -> dict[str, Any]:

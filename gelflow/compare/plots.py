@@ -9,6 +9,7 @@ from typing import Any
 from gelflow.compare.seeds import Group
 from gelflow.compare.strata import BARE, EDGE, MOTION, PATTERN, Stratum, pooled
 from gelflow.files.atomic import replacing
+from gelflow.methods.name import MethodName
 
 UNTIMED = ("no motion", "exact flow")
 """Methods that take no time worth drawing."""
@@ -32,7 +33,7 @@ def plot_work_precision(path: Path, groups: Sequence[Group], note: str) -> None:
     Methods that no other beats in both are joined; those that were fine-tuned on the very pairs are hollow and not
     part of the front. A black edge means that it ran on a GPU. The note says what the times were measured on.
     """
-    shown = [group for group in groups if group.name not in UNTIMED]
+    shown = [group for group in groups if group.name.label not in UNTIMED]
     candidates = [
         ("mean endpoint error (px)", "endpoint_error_px", 1.0),
         ("median distance from dots (px)", "dot_distance_px", 1.0),
@@ -44,13 +45,13 @@ def plot_work_precision(path: Path, groups: Sequence[Group], note: str) -> None:
     for axis, (label, field, sign) in zip(axes, panels, strict=False):
         known = [(g, 1000 * (g.mean("cost_seconds") or 0.0), g.mean(field) or 0.0) for g in shown
                  if _finite(g.mean(field))]  # fmt: skip
-        plain = [(x, y) for group, x, y in known if not group.fine_tuned]
+        plain = [(x, y) for group, x, y in known if not group.name.fine_tuned]
         joined = [plain[i] for i in pareto_front([(x, sign * y) for x, y in plain])]
         if joined:
             axis.plot(*zip(*joined, strict=True), "-", color=RED, linewidth=1, label="Pareto front")
         for group, x, y in known:
             colour, marker = looks[group.name]
-            face = "white" if group.fine_tuned else colour
+            face = "white" if group.name.fine_tuned else colour
             edge = "black" if any(one.on_gpu for one in group.members) else colour
             axis.plot(x, y, marker=marker, markersize=7, color=colour, markerfacecolor=face, markeredgecolor=edge,
                       linestyle="none", label=group.label)  # fmt: skip
@@ -64,7 +65,7 @@ def plot_work_precision(path: Path, groups: Sequence[Group], note: str) -> None:
     _save(figure, path, note)
 
 
-def plot_strata(path: Path, strata: Mapping[str, Sequence[Stratum]]) -> None:
+def plot_strata(path: Path, strata: Mapping[MethodName, Sequence[Stratum]]) -> None:
     """Writes a PNG with the mean endpoint error by true motion, by distance to the contact's edge and by patterns."""
     by_method = pooled(strata)
     present = {(one.kind, one.bin) for bins in by_method.values() for one in bins}
@@ -81,7 +82,7 @@ def plot_strata(path: Path, strata: Mapping[str, Sequence[Stratum]]) -> None:
             if drawn:
                 line = "none" if kind == PATTERN else "-"
                 look = {"marker": marker, "markersize": 4, "linewidth": 1, "linestyle": line}
-                axis.plot(*zip(*drawn, strict=True), color=colour, label=method, **look)
+                axis.plot(*zip(*drawn, strict=True), color=colour, label=str(method), **look)
         axis.set_yscale("log")
         axis.set_xticks(range(len(names)), [name.removesuffix(" px") for name in names], rotation=30, ha="right")
         axis.set_xlabel(kind if kind == PATTERN else f"{kind} (px)", fontsize=9)
@@ -94,7 +95,7 @@ def _finite(value: float | None) -> bool:
     return value is not None and math.isfinite(value)
 
 
-def _looks(names: Sequence[str]) -> dict[str, tuple[str, str]]:
+def _looks(names: Sequence[MethodName]) -> dict[MethodName, tuple[str, str]]:
     """Colour and marker of each method, the same in every panel; 56 differ."""
     return dict(zip(names, zip(cycle(COLOURS), cycle(MARKERS), strict=False), strict=False))
 

@@ -5,8 +5,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 
-from gelflow.baselines.learned import Learned, PublishedRaft
-from gelflow.baselines.method import Method
 from gelflow.compare.comparison import Comparison
 from gelflow.compare.plots import plot_strata, plot_work_precision
 from gelflow.compare.scores import PairScore, evaluate
@@ -15,6 +13,8 @@ from gelflow.compare.tables import Table, tables, with_pattern
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
 from gelflow.files.atomic import write_csv, write_text
+from gelflow.methods.learned import Learned, PublishedRaft
+from gelflow.methods.method import Method
 from gelflow.models.working_size import working_sizes
 
 
@@ -32,7 +32,7 @@ def compare(
     measured with `batch` pairs at once; 0: it is not. InputError for no method, two of one name, an `out` that holds
     other things, or a pair that cannot be read; OSError where a file cannot be written.
     """
-    names = [method.name for method in methods]
+    names = [str(method.name) for method in methods]
     if not names:
         raise InputError("no method given; there is nothing to compare")
     for name in names:

@@ -11,14 +11,17 @@ from typing import Any
 import numpy as np
 
 from gelflow.arrays import FlowArray, ImageArray, MapArray
-from gelflow.baselines.method import ExactFlow, Method, uncertainty
+from gelflow.baselines.exact import ExactFlow
 from gelflow.compare.dots import dot_distance, find_dots
 from gelflow.compare.metrics import closure, endpoint_error, flow_errors, image_similarity, marker_distance
 from gelflow.compare.strata import Stratum, pair_strata
 from gelflow.data.pairs import PairDataset
+from gelflow.data.record import PatternedScene
 from gelflow.errors import InputError, NothingFoundError
 from gelflow.files.exr import FlowField
 from gelflow.hardware import hardware
+from gelflow.methods.method import Method, uncertainty
+from gelflow.methods.name import MethodName
 from gelflow.models.uncertainty import CERTAIN_PX
 from gelflow.models.working_size import unknown_px
 
@@ -62,7 +65,7 @@ class PairScore(Measures):
 
     Attributes:
         method, pair: Their names.
-        scene: Scene and kind of pattern of a synthetic pair, "gelsight_mini, dots".
+        scene: Of a synthetic pair, or None.
         motion_px: Mean length of the true motion over the compared pixels.
         seconds: Run time of the method, images in memory to flow in memory.
         processor_seconds: Time of all its threads on the processor meanwhile; unlike `seconds` it does not grow with
@@ -72,9 +75,9 @@ class PairScore(Measures):
         strata: Its endpoint errors sorted by what they may depend on.
     """
 
-    method: str
+    method: MethodName
     pair: str
-    scene: str | None
+    scene: PatternedScene | None
     motion_px: float | None = None
     seconds: float
     processor_seconds: float
@@ -87,7 +90,7 @@ class PairScore(Measures):
 class MethodScore(Measures):
     """Means over pairs, pair by pair with equal weight; times are medians. None where no pair has the number."""
 
-    method: str
+    method: MethodName
     pairs: int
     seconds: float
     processor_seconds: float
@@ -162,7 +165,7 @@ def _without_truth(method: Method, image1: ImageArray, image2: ImageArray, flow:
     return found
 
 
-def _errors(flow: FlowArray, truth: FlowField, scene: str | None, sigma: MapArray) -> dict[str, Any]:
+def _errors(flow: FlowArray, truth: FlowField, scene: PatternedScene | None, sigma: MapArray) -> dict[str, Any]:
     """The fields of a score that need the exact flow."""
     errors: dict[str, Any] = flow_errors(flow, truth.flow, truth.visible)
     compared = np.logical_and(truth.visible, np.isfinite(truth.flow).all(axis=-1))

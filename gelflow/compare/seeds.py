@@ -1,43 +1,27 @@
 """Trainings that differ in nothing but their seed, as one row: mean and standard deviation.
 
-Methods whose labels differ in a number after "#" alone ("best#0", "best#1"; "best#0+ft", "best#1+ft") are one group.
-The standard deviation is the sample's (n - 1).
+Methods whose names (`gelflow.methods.name`) differ in their seed alone are one group. The standard deviation is the
+sample's (n - 1).
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from gelflow.compare.scores import MethodScore
-
-FINE_TUNED = "+ft"
-"""End of the names of methods that were optimised on the very pairs that they are scored on."""
-
-_SEED = re.compile(r"#\d+(?=$|\+ft$)")
-
-
-def group_name(method: str) -> str:
-    """A method's name without the number of its seed."""
-    return _SEED.sub("", method)
+from gelflow.compare.scores import MethodScore
+from gelflow.methods.name import MethodName
 
 
 @dataclass(frozen=True)
 class Group:
     """Scores of one training, or of several with different seeds."""
 
-    name: str
-    members: "tuple[MethodScore, ...]"
+    name: MethodName
+    members: tuple[MethodScore, ...]
 
     @property
     def label(self) -> str:
-        return self.name if len(self.members) == 1 else f"{self.name} ({len(self.members)} seeds)"
-
-    @property
-    def fine_tuned(self) -> bool:
-        return self.name.endswith(FINE_TUNED)
+        return str(self.name) if len(self.members) == 1 else f"{self.name} ({len(self.members)} seeds)"
 
     @property
     def device(self) -> str:
@@ -55,7 +39,7 @@ class Group:
         return None if len(values) < 2 or any(value is None for value in values) else stdev(values)
 
 
-def grouped(means: "Sequence[MethodScore]") -> list[Group]:
+def grouped(means: Sequence[MethodScore]) -> list[Group]:
     """Groups in the order in which their first members appear."""
-    names = dict.fromkeys(group_name(score.method) for score in means)
-    return [Group(name, tuple(s for s in means if group_name(s.method) == name)) for name in names]
+    names = dict.fromkeys(score.method.group for score in means)
+    return [Group(name, tuple(s for s in means if s.method.group == name)) for name in names]

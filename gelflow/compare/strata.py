@@ -17,14 +17,18 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from gelflow.arrays import FlowArray, MaskArray
-from gelflow.compare.seeds import group_name
-from gelflow.data.pairs import without_pattern
+from gelflow.data.record import PatternedScene
+from gelflow.methods.name import MethodName
 
 MOTION_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, np.inf)
 EDGE_PX = (-np.inf, -16.0, -4.0, 0.0, 4.0, 16.0, 64.0, np.inf)
 MOTION, EDGE, PATTERN, SCENE = "motion", "distance to contact edge", "pattern", "scene and pattern"
 BARE = ", bare gel"
 """End of the kinds of bins of gels without a pattern."""
+LIMITS: dict[str, Sequence[float]] = {
+    MOTION: MOTION_PX, EDGE: EDGE_PX, PATTERN: (), SCENE: (), MOTION + BARE: MOTION_PX, EDGE + BARE: EDGE_PX
+}  # fmt: skip
+"""Kinds of bins in their order, and the limits of those that have some."""
 
 
 @dataclass(frozen=True)
@@ -44,21 +48,21 @@ def pair_strata(
     truth: FlowArray,
     compared: MaskArray,
     contact: MaskArray | None = None,
-    scene: str | None = None,
+    scene: PatternedScene | None = None,
 ) -> tuple[Stratum, ...]:
     """The bins of one pair that hold pixels.
 
     `error` is the endpoint error (H, W) in px, `compared` where it counts, `contact` where the gel touches the indenter
-    in the second state, at pixels of image 1, and `scene` scene and kind of pattern, "gelsight_mini, dots".
+    in the second state, at pixels of image 1, and `scene` that of a synthetic pair.
     """
     motion = np.hypot(truth[..., 0], truth[..., 1])[compared]
     chosen = error[compared]
-    apart = BARE if without_pattern(scene) else ""
+    apart = BARE if scene is not None and scene.bare else ""
     strata = _binned(MOTION + apart, MOTION_PX, motion, chosen)
     if contact is not None and contact.any() and not contact.all():
         strata += _binned(EDGE + apart, EDGE_PX, signed_distance(contact)[compared], chosen)
     if scene is not None:
-        strata += [_stratum(PATTERN, scene.rpartition(", ")[2], chosen), _stratum(SCENE, scene, chosen)]
+        strata += [_stratum(PATTERN, scene.pattern, chosen), _stratum(SCENE, str(scene), chosen)]
     return tuple(strata)
 
 
@@ -106,17 +110,15 @@ def merged(strata: Iterable[Stratum]) -> list[Stratum]:
     return sorted(sums.values(), key=_order)
 
 
-def pooled(strata: Mapping[str, Sequence[Stratum]]) -> dict[str, list[Stratum]]:
+def pooled(strata: Mapping[MethodName, Sequence[Stratum]]) -> dict[MethodName, list[Stratum]]:
     """Bins by method with those of trainings that differ in their seed alone added up, under one name."""
-    bins: dict[str, list[Stratum]] = {}
+    bins: dict[MethodName, list[Stratum]] = {}
     for method, own in strata.items():
-        bins.setdefault(group_name(method), []).extend(own)
+        bins.setdefault(method.group, []).extend(own)
     return {name: merged(own) for name, own in bins.items()}
 
 
 def _order(stratum: Stratum) -> tuple[int, int, str]:
-    limits = {MOTION: MOTION_PX, EDGE: EDGE_PX}.get(stratum.kind.removesuffix(BARE), ())
-    names = [_name(low, high) for low, high in pairwise(limits)]
-    place = names.index(stratum.bin) if stratum.bin in names else 0
-    kinds = (MOTION, EDGE, PATTERN, SCENE, MOTION + BARE, EDGE + BARE)
-    return kinds.index(stratum.kind), place, stratum.bin
+    names = [_name(low, high) for low, high in pairwise(LIMITS[stratum.kind])]
+    place = names.index(stratum.bin) if names else 0
+    return list(LIMITS).index(stratum.kind), place, stratum.bin

@@ -1,6 +1,6 @@
 """The tables of a comparison.
 
-Methods that were optimised on the very pairs ("+ft") come last and, in the table of means, apart. Trainings that
+Methods that were optimised on the very pairs come last and, in the table of means, apart. Trainings that
 differ in their seed alone are one row (see `gelflow.compare.seeds`): mean ± standard deviation, pooled pixels in
 the strata.
 """
@@ -10,10 +10,10 @@ from statistics import fmean
 
 from gelflow.compare.comparison import Comparison
 from gelflow.compare.scores import MethodScore, PairScore, summarise
-from gelflow.compare.seeds import Group, group_name, grouped
+from gelflow.compare.seeds import Group, grouped
 from gelflow.compare.speed import Speed
 from gelflow.compare.strata import Stratum, pooled
-from gelflow.data.pairs import without_pattern
+from gelflow.methods.name import MethodName
 
 MOST_PAIRS_IN_A_TABLE = 12
 """Above this many pairs, tables show means only; CSV and JSON always have every pair."""
@@ -87,11 +87,11 @@ def pair_table(scores: Sequence[PairScore], fields: Sequence[str], form: str) ->
     `fields` of a score make a cell, `form` is how to write them, "{:.2f} / {:.3f}". Pairs for which no method has all
     of them are left out.
     """
-    found: dict[tuple[str, str], list[list[float]]] = {}
+    found: dict[tuple[MethodName, str], list[list[float]]] = {}
     for score in scores:
         values = [getattr(score, field) for field in fields]
         if None not in values:
-            found.setdefault((group_name(score.method), score.pair), []).append(values)
+            found.setdefault((score.method.group, score.pair), []).append(values)
     pairs = [pair for pair in dict.fromkeys(s.pair for s in scores) if any(pair == known for _, known in found)]
     rows = []
     for group in _ordered(summarise(scores)):
@@ -100,7 +100,7 @@ def pair_table(scores: Sequence[PairScore], fields: Sequence[str], form: str) ->
     return ["method", *pairs], rows if pairs else []
 
 
-def strata_table(strata: Mapping[str, Sequence[Stratum]]) -> Table:
+def strata_table(strata: Mapping[MethodName, Sequence[Stratum]]) -> Table:
     """Mean endpoint error in px, a row per bin, a column per method; every pixel of a bin counts the same."""
     by_method = pooled(strata)
     cells = {(name, s.kind, s.bin): s.error_px / s.pixels for name, bins in by_method.items() for s in bins}
@@ -109,15 +109,15 @@ def strata_table(strata: Mapping[str, Sequence[Stratum]]) -> Table:
         [f"{kind}: {part}", str(pixels), *(number(cells.get((name, kind, part)), 3) for name in by_method)]
         for (kind, part), pixels in sizes.items()
     ]
-    return ["where", "pixels", *by_method], rows
+    return ["where", "pixels", *map(str, by_method)], rows
 
 
-def speed_table(speeds: Mapping[str, Speed]) -> Table:
+def speed_table(speeds: Mapping[MethodName, Speed]) -> Table:
     """A row for the speed and memory of each network."""
     header = ["network", "device", "pairs at once", "size", "pairs/s", "peak memory MiB"]
     rows = [
         [name, s.device, str(s.batch), f"{s.size[0]}x{s.size[1]}", f"{s.pairs_per_second:.2f}", number(s.memory_mib, 0)]
-        for name, s in speeds.items()
+        for name, s in zip(map(str, speeds), speeds.values(), strict=True)
     ]
     return header, rows
 
@@ -126,7 +126,7 @@ def tables(comparison: Comparison) -> list[tuple[str, Table]]:
     """The tables of a comparison with their titles, as they are printed."""
     groups = _ordered(summarise(comparison.scores))
     pairs = len(comparison.pairs)
-    compared = summary_table([group for group in groups if not group.fine_tuned])
+    compared = summary_table([group for group in groups if not group.name.fine_tuned])
     explained = [EXPLAINED[name] for name in compared[0] if name in EXPLAINED]
     means = ".\n".join([f"Means over {pairs} pairs", *explained]) + "."
     patterned, some = with_pattern(comparison)
@@ -135,7 +135,7 @@ def tables(comparison: Comparison) -> list[tuple[str, Table]]:
     found = [
         (means, compared),
         (without, summary_table(patterned) if some < pairs else ([], [])),
-        (apart, summary_table([group for group in groups if group.fine_tuned])),
+        (apart, summary_table([group for group in groups if group.name.fine_tuned])),
     ]
     if pairs <= MOST_PAIRS_IN_A_TABLE:
         each = [
@@ -155,11 +155,11 @@ def tables(comparison: Comparison) -> list[tuple[str, Table]]:
 
 def with_pattern(comparison: Comparison) -> tuple[list[Group], int]:
     """Means over the pairs of gels with a pattern, and their number; over all pairs if no gel has one."""
-    scores = [score for score in comparison.scores if not without_pattern(score.scene)]
+    scores = [score for score in comparison.scores if score.scene is None or not score.scene.bare]
     scores = scores or list(comparison.scores)
     return _ordered(summarise(scores)), len({score.pair for score in scores})
 
 
 def _ordered(means: Sequence[MethodScore]) -> list[Group]:
     """Groups, those that were optimised on the pairs last."""
-    return sorted(grouped(means), key=lambda group: group.fine_tuned)
+    return sorted(grouped(means), key=lambda group: group.name.fine_tuned)

@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from gelflow.data.pairs import PairDataset, PairRecord
+from gelflow.data.pairs import PairDataset
 from gelflow.data.pairset import FILE as PAIR_SET_FILE
 from gelflow.data.pairset import pair_set_records
+from gelflow.data.record import PairRecord
 from gelflow.data.shards import shard_files, shard_records
 from gelflow.data.synthetic import is_synthetic, synthetic_records
 from gelflow.errors import InputError

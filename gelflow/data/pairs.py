@@ -4,7 +4,6 @@ import csv
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
@@ -15,39 +14,11 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from gelflow.arrays import ImageArray, MarkerArray
-from gelflow.data.member import FlowMembers, Member
+from gelflow.data.member import FlowMembers
+from gelflow.data.record import PairRecord
 from gelflow.errors import InputError
-from gelflow.files.exr import Direction, FlowField, read_flow
+from gelflow.files.exr import FlowField, read_flow
 from gelflow.files.image import read_pair
-
-
-@dataclass(frozen=True)
-class PairRecord:
-    """Where one pair lies on disk: in files of its own, or in a shard.
-
-    Attributes:
-        name: Unique within its data set.
-        image1, image2: Image files of one size.
-        flow: EXR file, or members of a shard, with the exact flow in both directions, or None.
-        markers: CSV file with tracked dots (columns x1, y1, x2, y2 in px), or None.
-        scene: Scene and kind of pattern of a synthetic pair, or None.
-        origin: Hash of its data set's scene, and its seed; or None.
-        direction: Which of the flows in an EXR file is from image 1 to image 2.
-    """
-
-    name: str
-    image1: Path | Member
-    image2: Path | Member
-    flow: Path | FlowMembers | None = None
-    markers: Path | None = None
-    scene: str | None = None
-    origin: str | None = None
-    direction: Direction = "forward"
-
-
-def without_pattern(scene: str | None) -> bool:
-    """Whether a pair's "scene, kind of pattern" says that its gel has none."""
-    return scene is not None and scene.rpartition(", ")[2] == "none"
 
 
 class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
@@ -101,7 +72,7 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
     @property
     def digest(self) -> str:
         """SHA-256 of what tells data sets apart without reading an image: names, scenes and origins of the pairs."""
-        known = [(record.name, record.scene, record.origin) for record in self.records]
+        known = [(record.name, record.scene and str(record.scene), record.origin) for record in self.records]
         return hashlib.sha256(json.dumps(known).encode()).hexdigest()
 
     def images(self, index: int) -> tuple[ImageArray, ImageArray]:
@@ -137,9 +108,8 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
         images, record = self.images(index), self.records[index]
         size = images[0].shape[:2]
         image1, image2 = (_channels_first(image) for image in images)
-        sample: dict[str, Tensor | str | bool] = {
-            "image1": image1, "image2": image2, "name": record.name, "bare": without_pattern(record.scene)
-        }  # fmt: skip
+        bare = record.scene is not None and record.scene.bare
+        sample: dict[str, Tensor | str | bool] = {"image1": image1, "image2": image2, "name": record.name, "bare": bare}
         if not self.has_flow:
             return sample
         truth = self.truth(index)

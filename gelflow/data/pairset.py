@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 
-from gelflow.data.pairs import PairRecord
+from gelflow.data.record import PairRecord
 from gelflow.errors import InputError
 from gelflow.files.atomic import write_text
 from gelflow.untrusted import inside, read_file

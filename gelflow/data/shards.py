@@ -20,8 +20,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gelflow.data.member import FlowMembers, Member
-from gelflow.data.pairs import PairRecord
-from gelflow.data.synthetic import origin, scene_and_pattern
+from gelflow.data.record import PairRecord
+from gelflow.data.synthetic import origin, patterned_scene
 from gelflow.errors import InputError
 from gelflow.untrusted import inside, parsed
 
@@ -108,4 +108,4 @@ def _record(shard: Path, key: str, members: dict[str, Member]) -> PairRecord:
     except ValueError:
         meta = None  # written by another program
     images = (members["image1.png"], members["image2.png"])
-    return PairRecord(key, *images, flow, scene=scene_and_pattern(meta), origin=origin(meta))
+    return PairRecord(key, *images, flow, scene=patterned_scene(meta), origin=origin(meta))

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gelflow.data.pairs import PairRecord
+from gelflow.data.record import PairRecord, PatternedScene
 from gelflow.errors import InputError
 from gelflow.files.exr import Direction
 from gelflow.untrusted import parsed, read_file
@@ -43,7 +43,7 @@ def synthetic_records(folder: Path, frames_apart: int | None = None) -> list[Pai
     for index, frames in sorted(_finished(manifest).items()):
         name = f"{index:06d}"
         sample = folder / ("clips" if of_clips else "samples") / name
-        scene = scene_and_pattern(header, sample / "meta.json")
+        scene = patterned_scene(header, sample / "meta.json")
         if of_clips:
             found = _clip_pairs(name, sample, frames, frames_apart, outputs.get("previous") is True)
         else:
@@ -86,14 +86,14 @@ def origin(description: Any) -> str | None:
         return None
 
 
-def scene_and_pattern(header: Any, meta: Path | None = None) -> str | None:
-    """Scene and kind of pattern, "gelsight_mini, dots"; where the latter is random, that of the sample's `meta`."""
+def patterned_scene(header: Any, meta: Path | None = None) -> PatternedScene | None:
+    """Scene and kind of pattern; where the latter is random, that of the sample's `meta`."""
     try:
         scene = header["scene"]
         kind = scene["sensor"]["pattern"].get("kind")
         if not isinstance(kind, str) and meta is not None:
             kind = json.loads(read_file(meta))["scene"]["sensor"]["pattern"]["kind"]
-        return f"{scene['name']}, {kind}"
+        return PatternedScene(str(scene["name"]), str(kind))
     except (KeyError, TypeError, AttributeError, OSError, ValueError, RecursionError):
         return None  # written by another program, or before patterns were recorded
 

@@ -24,7 +24,7 @@ from gelflow.models.estimate import estimate_flow
 from gelflow.models.weights import load_weights, weights_file
 
 Network = Callable[[ImageArray, ImageArray], FlowArray]
-"""Gives the flow between two images of one size; `gelflow.baselines.method.Method.flow`."""
+"""Gives the flow between two images of one size; `gelflow.methods.method.Method.flow`."""
 CHOICE_WINDOW_PX = 25.0
 """Standard deviation of the window in which starts are compared."""
 MIN_GAIN = 0.95

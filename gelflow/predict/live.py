@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.arrays import Bytes3, Estimate, FlowArray
-from gelflow.baselines.method import Method
 from gelflow.errors import InputError
 from gelflow.files.image import full_range, in_unit_range, to_bytes
 from gelflow.files.video import newest_frames
+from gelflow.methods.method import Method
 from gelflow.predict.prediction import Motion, motion_of
 from gelflow.predict.stream import Indexed, Reference, followed
 

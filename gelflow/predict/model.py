@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gelflow.arrays import Bytes3, Estimate, Flow, FlowArray, ImageArray, Images
-from gelflow.baselines.learned import Learned
-from gelflow.baselines.method import estimated
 from gelflow.config import Registration
 from gelflow.errors import InputError
-from gelflow.fast.method import Fast, fast, is_fast
 from gelflow.files.image import THREE_OF, as_image, check_range, full_range, range_factor
+from gelflow.methods.fast import Fast, fast, is_fast
+from gelflow.methods.learned import Learned
+from gelflow.methods.method import estimated
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.weights import SHIPPED, weights_file
 
@@ -110,7 +110,7 @@ def load_model(
     Args:
         name_or_path: "best", the weights that come with the package; a file that `gelflow train` or `finetune` wrote
             (weights.safetensors); or "fast", DIS with fast registration on the processor, which takes a thirtieth of
-            the time, or a third where it asks the network of "best" for a start (see `gelflow.fast.method`).
+            the time, or a third where it asks the network of "best" for a start (see `gelflow.methods.fast`).
         device: "cpu", "cuda", or "auto", a CUDA device where there is one.
         registration: "none", "motion", "both" or "brightness": how the flow is corrected on the images; None: what the
             weights ask for, which is "motion" for "best".

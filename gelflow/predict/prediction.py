@@ -14,14 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.arrays import Bytes3, Estimate, FlowArray, Frame
-from gelflow.baselines.method import Method, estimated
-from gelflow.data.pairs import PairDataset, PairRecord
+from gelflow.data.pairs import PairDataset
+from gelflow.data.record import PairRecord
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, write_csv
 from gelflow.files.exr import DIRECTIONS, read_flow, write_flo, write_flow
 from gelflow.files.image import full_range, in_unit_range, to_bytes
 from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
+from gelflow.methods.method import Method, estimated
 from gelflow.models.working_size import unknown_px
 from gelflow.predict.pictures import certain, draw_overlay, robust_scale, write_flow_picture
 from gelflow.predict.stream import Indexed, Reference, followed

@@ -7,10 +7,10 @@ from typing import Any, Literal, NamedTuple
 from numpy.typing import NDArray
 
 from gelflow.arrays import Estimate, FlowArray, Frame
-from gelflow.baselines.method import Method, estimated
 from gelflow.errors import InputError
-from gelflow.fast.method import Fast
 from gelflow.files.image import full_range, in_unit_range
+from gelflow.methods.fast import Fast
+from gelflow.methods.method import Method, estimated
 from gelflow.track.markers import Markers
 from gelflow.track.tracker import Tracker
 

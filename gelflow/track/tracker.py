@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.arrays import Bytes3, FlowArray, ImageArray, MapArray
-from gelflow.baselines.learned import open_network
 from gelflow.errors import InputError
 from gelflow.fast.certainty import Refined, refined
-from gelflow.fast.method import FAST, Fast
 from gelflow.fast.registration import STAGES, Prepared, indices, register, resized
 from gelflow.fast.start import MOST_TORN, dis, fresh_start
 from gelflow.files.image import as_image, check_images, range_factor
+from gelflow.methods.fast import FAST, Fast
+from gelflow.methods.learned import open_network
 from gelflow.models.uncertainty import MAX_SIGMA_PX
 from gelflow.models.weights import weights_file
 from gelflow.track.markers import Markers

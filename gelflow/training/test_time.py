@@ -14,15 +14,15 @@ the network that it came from.
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gelflow.baselines.learned import Learned
-from gelflow.compare.seeds import FINE_TUNED
 from gelflow.config import TrainConfig
 from gelflow.config.validation import validated
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
+from gelflow.methods.learned import Learned
 from gelflow.models.weights import read_metadata
 from gelflow.training.run import train
 from gelflow.training.state import STATE
@@ -70,7 +70,7 @@ def fine_tuning_settings(method: Learned, steps: int, pairs: int) -> TrainConfig
 
 
 def fine_tuned(method: Learned, dataset: PairDataset, out: Path, steps: int) -> Learned:
-    """Trains a copy of a network on the pairs of a comparison; its name ends with "+ft".
+    """Trains a copy of a network on the pairs of a comparison; its name says so.
 
     A run of the same settings in the folder `out` is resumed, or used if it is finished. It is the same run however the
     flow is registered. InputError where the pairs differ in size and the network has none of its own; see also
@@ -83,4 +83,5 @@ def fine_tuned(method: Learned, dataset: PairDataset, out: Path, steps: int) -> 
         raise InputError(f"--ft {steps}: the pairs have {given} px, a batch needs one size; give --size ROWSxCOLUMNS")
     resume = (out / STATE).is_file()
     result = train(settings, dataset, None, out, initial=method.path, resume=resume)
-    return Learned(result.weights, f"{method.name}{FINE_TUNED}", method.size, method.device, method.registration)
+    name = replace(method.name, fine_tuned=True)
+    return Learned(result.weights, name, method.size, method.device, method.registration)

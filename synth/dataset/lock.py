@@ -28,9 +28,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from synth.dataset.jsontext import parse_document
+from synth.dataset.objects import Objects
 from synth.dataset.shard import Shard
 from synth.dataset.storage import storage_errors
-from synth.dataset.store import Store
 from synth.errors import InputError
 
 LOCK_FILE = ".lock"
@@ -151,8 +151,9 @@ class Lease:
     Nobody knows to be the last here, so that shards leave it to a plain run to put the dataset together.
     """
 
-    def __init__(self, store: Store) -> None:
-        self._store, self._name = store, ""
+    def __init__(self, objects: Objects) -> None:
+        self._objects = objects
+        self._name = ""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._renew_until_released, daemon=True)
 
@@ -163,7 +164,7 @@ class Lease:
         InputError where another process writes there, or the storage refuses.
         """
         own = f"{shard.name if shard else 'whole'}.json"
-        for name in self._store.names(LEASES_FOLDER):
+        for name in self._objects.names(LEASES_FOLDER):
             # A plain run tolerates nobody; a shard tolerates other shards of the same job.
             if shard is None or name in (own, "whole.json"):
                 self._refuse_if_alive(f"{LEASES_FOLDER}/{name}")
@@ -188,10 +189,10 @@ class Lease:
             return
         self._ended.set()
         self._thread.join()
-        self._store.delete([self._name])
+        self._objects.delete([self._name])
 
     def _refuse_if_alive(self, name: str) -> None:
-        content = self._store.read(name)
+        content = self._objects.read(name)
         try:
             note = parse_document(content or b"{}", name)
             age, host, pid = time.time() - float(note["time"]), str(note["host"]), int(note["pid"])
@@ -201,13 +202,13 @@ class Lease:
         if not abs(age) <= EXPIRES_S or (host == socket.gethostname() and not Path(f"/proc/{pid}").exists()):
             return
         raise InputError(
-            f"{self._store.out}: another process (pid {pid} on {host}) is writing this dataset, last heard of "
+            f"{self._objects.out}: another process (pid {pid} on {host}) is writing this dataset, last heard of "
             f"{age:.0f} s ago; wait for it to end (if it was killed, {EXPIRES_S:.0f} s), or give another --out"
         )
 
     def _renew(self) -> None:
         note = {"pid": os.getpid(), "host": socket.gethostname(), "time": time.time()}
-        self._store.write(self._name, json.dumps(note).encode())
+        self._objects.write(self._name, json.dumps(note).encode())
 
     def _renew_until_released(self) -> None:
         while not self._ended.wait(RENEWED_S):

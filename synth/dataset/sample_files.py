@@ -2,7 +2,6 @@
 
 import hashlib
 import shutil
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from synth.dataset.manifest import ManifestEntry
 from synth.dataset.npz import encode_npz
 from synth.dataset.sample import Layout, Sample, largest_motion, sample_name
 from synth.dataset.storage import install_folder, partial_name, storage_errors
-from synth.dataset.store import Output, Store
+from synth.dataset.store import Output, open_store
 from synth.dataset.tracks import MARKERS, MARKERS_FILE, STATES_FILE, encode_table, states_columns, states_of
 
 SOLVER_MEANINGS = {
@@ -28,18 +27,13 @@ def write_sample_files(out: Output, sample: Sample, job: Job) -> ManifestEntry:
     """Writes samples/NNNNNN or clips/NNNNNN, in a directory whole or not at all; equal samples give equal bytes.
 
     An older folder of that number is replaced: without a line in the manifest it counts as unfinished. The dataset was
-    opened by a `DatasetWriter` of some process; under a URL the files are made in a folder of this machine's temporary
-    space and copied. The job is for the header of flow files. Returns what `DatasetWriter.record` appends to the
-    manifest, but for the times. InputError where the storage refuses (disk full, no permission).
+    opened by a `DatasetWriter` of some process. The job is for the header of flow files. Returns what
+    `DatasetWriter.record` appends to the manifest, but for the times. InputError where the storage refuses (disk full,
+    no permission).
     """
-    store, layout = Store(out), Layout.of(job.scene)
-    name = f"{layout.folder}/{sample_name(sample.index)}"
-    if store.directory is not None:
-        return _write_folder(store.directory / name, sample, job, layout)
-    with tempfile.TemporaryDirectory(prefix="synth-") as temporary:
-        entry = _write_folder(Path(temporary) / name, sample, job, layout)
-        store.put(Path(temporary) / name, name)
-    return entry
+    layout = Layout.of(job.scene)
+    with open_store(out).placing(f"{layout.folder}/{sample_name(sample.index)}") as folder:
+        return _write_folder(folder, sample, job, layout)
 
 
 def _write_folder(final: Path, sample: Sample, job: Job, layout: Layout) -> ManifestEntry:

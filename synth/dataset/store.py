@@ -1,20 +1,23 @@
-"""The place of a dataset: a local directory, or a folder of objects under an fsspec URL (s3://, gs://, sftp:// ...).
+"""The place of a dataset, behind one interface: a local directory, or a folder of objects under a URL.
 
-In a directory, content takes its place by one rename and is flushed to the disk. An object store knows neither renaming
-nor appending nor locks; what is written there relies on none of them: each object is put or read as a whole.
-Reference: https://filesystem-spec.readthedocs.io
+In a directory, content takes its place by one rename and is flushed to the disk; processes see each other by locks.
+Under a URL files are made in a folder of this machine's temporary space and copied; notes stand for locks.
 """
 
 import contextlib
-import os
 import tempfile
-from collections.abc import Iterable, Iterator
-from functools import cache, cached_property
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote, urlparse
 
-from synth.dataset.storage import replace_file
+from synth.dataset.jsontext import read_document
+from synth.dataset.lines import JournalLines, Lines
+from synth.dataset.lock import DirectoryLock, Lease
+from synth.dataset.objects import Objects, refusals
+from synth.dataset.sample import Layout, sample_name
+from synth.dataset.shard import Shard
+from synth.dataset.storage import replace_file, storage_errors
 from synth.errors import InputError
 from synth.untrusted import read_file
 
@@ -35,117 +38,126 @@ def is_shared(out: Output) -> bool:
     return isinstance(out, Path) or "memory" not in out.split("://")[0]
 
 
-class Store:
-    """Files or objects by their name in a dataset, such as "samples/000000/meta.json".
+class DirectoryStore:
+    """A local directory: files by their name in a dataset, such as "samples/000000/meta.json".
 
-    Every method raises InputError where the storage refuses. `out` is the place, for messages; `directory` the same
-    where it is a local directory, else None.
+    `out` is the place, for messages. Every method raises InputError where the storage refuses.
     """
 
-    def __init__(self, out: Path | str) -> None:
-        place = output_of(out)
-        self.directory = place if isinstance(place, Path) else None
-        self.out = place if isinstance(place, Path) else place.rstrip("/")
-
-    @cached_property
-    def _place(self) -> tuple[Any, str]:
-        """The file system and the root's path in it.
-
-        InputError where the protocol is unknown or its package is missing.
-        """
-        from fsspec.core import url_to_fs
-        from fsspec.implementations.local import LocalFileSystem
-
-        if self.directory is not None:
-            return LocalFileSystem(), os.path.abspath(self.directory)
-        try:
-            system, root = url_to_fs(self.out)
-        except (ImportError, ValueError) as error:
-            raise InputError(f"--out {self.out}: {error}") from error
-        return system, root.rstrip("/")
+    def __init__(self, directory: Path) -> None:
+        self.out = directory
 
     def read(self, name: str) -> bytes | None:
         """The content; None where there is nothing of that name."""
-        system, root = self._place
-        with self._errors(name), contextlib.suppress(FileNotFoundError):
-            return (
-                bytes(system.cat_file(f"{root}/{name}")) if self.directory is None else read_file(self.directory / name)
-            )
+        with refusals(f"{self.out}/{name}"), contextlib.suppress(FileNotFoundError):
+            return read_file(self.out / name)
         return None
 
     def write(self, name: str, content: bytes) -> None:
-        """Gives a file or an object its content as a whole."""
-        if self.directory is not None:
-            replace_file(self.directory / name, content)
-            return
-        system, root = self._place
-        with self._errors(name):
-            self._make_folder(f"{root}/{name}")
-            system.pipe_file(f"{root}/{name}", content)
+        """Gives a file its content as a whole."""
+        replace_file(self.out / name, content)
 
-    def put(self, path: Path, name: str) -> None:
-        """Copies a local file, or the files of a local folder, to objects."""
-        system, root = self._place
-        with self._errors(name):
-            for file in sorted(file for file in (path, *path.rglob("*")) if file.is_file()):
-                target = f"{root}/{name}/{file.relative_to(path).as_posix()}".removesuffix("/.")
-                self._make_folder(target)
-                system.put_file(str(file), target)
+    def content(self) -> list[str]:
+        """Names of what is there; InputError where it is nothing that a dataset may be written into."""
+        if not self.out.exists():
+            return []
+        if not self.out.is_dir():
+            raise InputError(f"{self.out}: is a file; --out needs a directory")
+        with refusals(f"{self.out}/"):
+            paths = sorted(self.out.iterdir())
+        for path in paths:
+            if path.is_symlink():
+                raise InputError(f"{path}: is a link; a dataset is written in its own folder alone")
+        return [path.name for path in paths]
 
-    def get(self, name: str, path: Path) -> None:
-        """Copies an object to a local file; nothing where there is none."""
-        system, root = self._place
-        with self._errors(name):
-            if system.exists(f"{root}/{name}"):
-                system.get_file(f"{root}/{name}", str(path))
-
-    def exists(self, name: str) -> bool:
-        system, root = self._place
-        with self._errors(name):
-            return bool(system.exists(f"{root}/{name}"))
-
-    def names(self, folder: str = "") -> list[str]:
-        """Names of what is directly in a folder; none where there is no such folder."""
-        system, root = self._place
-        with self._errors(folder), contextlib.suppress(FileNotFoundError):
-            system.invalidate_cache()
-            listed = system.ls(f"{root}/{folder}".rstrip("/"), detail=False)
-            return sorted(str(path).rstrip("/").rpartition("/")[2] for path in listed)
-        return []
-
-    def delete(self, names: Iterable[str]) -> None:
-        """Removes objects; those that are gone already do not matter."""
-        system, root = self._place
-        for name in names:
-            with self._errors(name), contextlib.suppress(FileNotFoundError):
-                system.rm_file(f"{root}/{name}")
-
-    def _make_folder(self, target: str) -> None:
-        """The folder of an object, where the store has folders."""
-        self._place[0].makedirs(target.rpartition("/")[0], exist_ok=True)
+    def lock(self) -> DirectoryLock:
+        """What says who may write; holds nothing yet."""
+        with storage_errors(self.out):
+            self.out.mkdir(parents=True, exist_ok=True)
+        return DirectoryLock(self.out)
 
     @contextlib.contextmanager
-    def _errors(self, name: str) -> Iterator[None]:
-        """Every driver of fsspec has errors of its own, besides OSError: at this border all become one message."""
-        try:
-            yield
-        except Exception as error:
-            raise InputError(
-                f"{self.out}/{name}: the storage refuses: {type(error).__name__}: {error}; what was finished before is "
-                "safe, put this right and give the same command again to go on"
-            ) from error
+    def lines(self, layout: Layout) -> Iterator[Lines]:
+        """The lines of manifest and failures, while they are written."""
+        yield Lines(self.out, layout.folder, lambda index: self.holds(layout, index))
+
+    def holds(self, layout: Layout, index: int) -> bool:
+        """Whether a sample's files are there."""
+        folder, frames = self.out / layout.folder / sample_name(index), 2
+        if layout.is_of_clips:
+            try:
+                frames = len(read_document(folder / "meta.json")["frames"])
+            except (InputError, KeyError, TypeError):
+                return False
+        return all((folder / file).is_file() for file in layout.files(frames))
+
+    @contextlib.contextmanager
+    def placing(self, name: str) -> Iterator[Path]:
+        """A local path for the new content of a folder, which is in the dataset in the end."""
+        yield self.out / name
+
+    def meshes(self) -> Path:
+        """A folder of this machine that holds the dataset's meshes."""
+        return self.out / MESHES_FOLDER
+
+    @contextlib.contextmanager
+    def making_meshes(self, shard: Shard | None) -> Iterator[Path]:
+        """`meshes`; what is made there is in the dataset in the end, or InputError where a shard may not make any."""
+        yield self.meshes()
 
 
-def mesh_folder(out: Output) -> Path:
-    """A folder of this machine that holds the dataset's meshes; InputError where the storage refuses."""
-    store = Store(out)
-    if store.directory is not None:
-        return store.directory / MESHES_FOLDER
-    folder = Path(_temporary_folder(str(store.out)).name)
-    for name in store.names(MESHES_FOLDER):
-        if not (folder / name).exists():
-            store.get(f"{MESHES_FOLDER}/{name}", folder / name)
-    return folder
+class RemoteStore(Objects):
+    """A folder of objects under a URL, with the methods of a `DirectoryStore`."""
+
+    def content(self) -> list[str]:
+        return self.names()
+
+    def lock(self) -> Lease:
+        return Lease(self)
+
+    @contextlib.contextmanager
+    def lines(self, layout: Layout) -> Iterator[Lines]:
+        with tempfile.TemporaryDirectory(prefix="synth-") as copy:
+            yield JournalLines(Path(copy), layout.folder, self)
+
+    def holds(self, layout: Layout, index: int) -> bool:
+        """One object is asked for; a line is recorded after all of them were put."""
+        return self.exists(f"{layout.folder}/{sample_name(index)}/meta.json")
+
+    @contextlib.contextmanager
+    def placing(self, name: str) -> Iterator[Path]:
+        with tempfile.TemporaryDirectory(prefix="synth-") as temporary:
+            yield Path(temporary) / name
+            self.put(Path(temporary) / name, name)
+
+    def meshes(self) -> Path:
+        folder = Path(_temporary_folder(self.out).name)
+        for name in self.names(MESHES_FOLDER):
+            if not (folder / name).exists():
+                self.get(f"{MESHES_FOLDER}/{name}", folder / name)
+        return folder
+
+    @contextlib.contextmanager
+    def making_meshes(self, shard: Shard | None) -> Iterator[Path]:
+        folder = self.meshes()
+        before = set(folder.glob("*"))
+        yield folder
+        for path in set(folder.glob("*")) - before:
+            if shard is not None:  # another shard might have made another one meanwhile
+                raise InputError(
+                    f"{self.out}: shards need the mesh to be there: give the command with --n 1, without --shard, first"
+                )
+            self.put(path, f"{MESHES_FOLDER}/{path.name}")
+
+
+Store = DirectoryStore | RemoteStore
+"""What a writer needs of a place: they have the same methods."""
+
+
+def open_store(out: Output) -> Store:
+    """The store at a place."""
+    place = output_of(out)
+    return DirectoryStore(place) if isinstance(place, Path) else RemoteStore(place)
 
 
 @cache

@@ -10,7 +10,7 @@ import numpy as np
 
 from synth.dataset.job import Job
 from synth.dataset.manifest import Failure, ManifestEntry
-from synth.dataset.store import Output, mesh_folder
+from synth.dataset.store import Output, open_store
 from synth.planning import Plan
 from synth.press.load_path import LoadPath
 from synth.press.resolution import Accuracy
@@ -35,7 +35,7 @@ class JobContext:
     @property
     def mesh_folders(self) -> tuple[Path, Path] | None:
         """Folders of fTetWild's meshes, which are random, so that all must use the same ones. None for other meshes."""
-        return (mesh_folder(self.out), self.cache) if self.plan.mesh.kind == "tetwild" else None
+        return (open_store(self.out).meshes(), self.cache) if self.plan.mesh.kind == "tetwild" else None
 
     def stream(self, purpose: str, *numbers: int) -> np.random.Generator:
         return stream(self.plan.template, self.job.seed, purpose, *numbers)

@@ -14,12 +14,13 @@ from textures import REAL, as_bytes, moved
 from gelflow.baselines import CLASSICAL, named_methods
 from gelflow.baselines.aldic import ALDIC, INSTALL
 from gelflow.baselines.classical import dis
-from gelflow.baselines.method import as_tensor, dense_flow
 from gelflow.baselines.registry import REGISTERED
+from gelflow.baselines.scattered import dense_flow
 from gelflow.compare.metrics import flow_errors, image_similarity, marker_distance, psnr, ssim_map, warp_image
 from gelflow.compare.scores import score_pair
 from gelflow.config import REGISTRATIONS, Registration
 from gelflow.data import PairDataset
+from gelflow.methods.method import as_tensor
 from gelflow.models.registration import registered
 
 SHIFT = (0.7, -0.4)

@@ -19,15 +19,20 @@ from gelflow.compare.scores import evaluate, score_pair, summarise
 from gelflow.compare.seeds import grouped
 from gelflow.compare.tables import pair_table, summary_table
 from gelflow.data import PairDataset, open_all
+from gelflow.methods.name import MethodName
 
 SHIFTS = [(3.0, 4.0), (0.0, 0.5), (1.0, 0.0), (2.0, 0.0)]
 
 
 @dataclass(frozen=True)
 class Constant:
-    name: str
+    text: str
     u: float
     v: float
+
+    @property
+    def name(self) -> MethodName:
+        return MethodName.parse(self.text)
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
         return np.full((*image1.shape[:2], 2), (self.u, self.v), np.float32)
@@ -56,7 +61,7 @@ def test_files_hold_every_score(tmp_path: Path) -> None:
     scores = written.scores
     assert written.pairs == dataset.names
     rows = table(out / "scores.csv")
-    assert [(row["method"], row["pair"]) for row in rows] == [(score.method, score.pair) for score in scores]
+    assert [(row["method"], row["pair"]) for row in rows] == [(str(score.method), score.pair) for score in scores]
     assert float(rows[0]["endpoint_error_px"]) == scores[0].endpoint_error_px == 1.0
     content = json.loads((out / "scores.json").read_text())
     assert [method["method"] for method in content["methods"]] == ["no motion", "Farnebäck", "DIS medium"]
@@ -107,13 +112,13 @@ def test_where_nothing_can_be_followed_no_motion_counts_and_exact_flow_is_for_sy
     for number in (1, 2):
         save(folder / f"b_{number}.png", np.full((64, 80, 3), 0.5, np.float32))
     tracked, none = compare(named_methods(["lucas-kanade", "none"]), PairDataset(folder)).scores[1::2]
-    assert (tracked.method, tracked.pair, tracked.ssim) == ("Lucas-Kanade", "b", none.ssim)
+    assert (str(tracked.method), tracked.pair, tracked.ssim) == ("Lucas-Kanade", "b", none.ssim)
     assert math.isinf(tracked.psnr_db)
     dataset = PairDataset(write_synthetic(tmp_path / "exact", [(2.0, 1.0)]))
     (exact,) = evaluate(named_methods(["exact"])[0], dataset)
     (true,) = evaluate(Constant("true", 2, 1), dataset)
     (none,) = evaluate(Constant("none", 0, 0), dataset)
-    assert (exact.method, exact.endpoint_error_px, exact.outliers_01px) == ("exact flow", 0.0, 0.0)
+    assert (str(exact.method), exact.endpoint_error_px, exact.outliers_01px) == ("exact flow", 0.0, 0.0)
     assert none.psnr_db + 3 < exact.psnr_db < true.psnr_db  # the strip of 8 of 80 px does move in these images
     plain = PairDataset(write_folder(tmp_path / "plain", {"a": (1, 0)}))
     words = "pair a, exact flow: the pair has no exact flow; leave the method exact out"

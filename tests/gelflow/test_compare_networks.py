@@ -19,8 +19,6 @@ from waves import Shifts, random_weights, same_weights, small
 import gelflow.compare.run
 import gelflow.models.gelflow
 from gelflow.arrays import FlowArray, ImageArray
-from gelflow.baselines.learned import Learned
-from gelflow.baselines.method import as_tensor
 from gelflow.cli import main
 from gelflow.compare.plots import pareto_front
 from gelflow.compare.run import compare
@@ -30,6 +28,9 @@ from gelflow.config import REGISTRATIONS, ModelConfig, MotionConfig, Registratio
 from gelflow.config.sources import train_config
 from gelflow.data import PairDataset, open_all
 from gelflow.files.exr import read_flow
+from gelflow.methods.learned import Learned
+from gelflow.methods.method import as_tensor
+from gelflow.methods.name import MethodName
 from gelflow.models.raft import RAFT
 from gelflow.models.registration import registered
 from gelflow.models.weights import read_metadata
@@ -160,9 +161,9 @@ def test_fine_tuning_does_not_look_at_exact_flow_and_needs_one_size(tmp_path: Pa
     shifts = [(1.5, 0.5), (-1.0, 0.0)]
     plain = PairDataset(write_folder(tmp_path / "plain", {"a": shifts[0], "b": shifts[1]}))
     exact = PairDataset(write_synthetic(tmp_path / "exact", shifts))
-    method = Learned(unsuitable(tmp_path / "w.safetensors"), "net", device="cpu")
+    method = Learned(unsuitable(tmp_path / "w.safetensors"), MethodName("net"), device="cpu")
     runs = [fine_tuned(method, dataset, tmp_path / f"run{k}", 3) for k, dataset in enumerate((plain, exact))]
-    assert [run.name for run in runs] == ["net+ft"] * 2
+    assert [str(run.name) for run in runs] == ["net+ft"] * 2
     assert same_weights(runs[0].path, runs[1].path)
     assert not same_weights(runs[0].path, method.path)
     recorded = json.loads(read_metadata(runs[0].path)["train"])
@@ -192,13 +193,15 @@ def test_settings_are_the_weights_own_or_those_of_an_aim_which_the_name_says(pla
         (own, None, OWN, "+registration"), (own, "none", None, ""), (own, "brightness", brightness, "+brightness"),
     ]  # fmt: skip
     for path, choice, config, added in expected:
-        method = Learned(path, "net", device="cpu", registration=choice)
+        method = Learned(path, MethodName("net"), device="cpu", registration=choice)
         assert method.model.config.registration == config
-        assert method.name == f"net{added}"
+        assert str(method.name) == f"net{added}"
     names = {"net": "net+motion", "net#2": "net+motion#2", "net#2+ft": "net+motion#2+ft", "net+ft": "net+motion+ft",
              "net+motion": "net+motion", "C# code": "C# code+motion"}  # fmt: skip
-    found = {label: Learned(plain, label, device="cpu", registration="motion").name for label in names}
-    assert found == names
+    given = [MethodName.parse(label) for label in names]
+    assert [str(name) for name in given] == list(names)
+    methods = [Learned(plain, name, device="cpu", registration="motion") for name in given]
+    assert [str(method.name) for method in methods] == list(names.values())
 
 
 def test_rows_without_and_with_registration_stand_in_one_table_with_one_of_raft(plain, raft, tmp_path) -> None:
@@ -242,7 +245,7 @@ def test_the_speed_of_the_network_alone_includes_it(own: Path, tmp_path: Path, m
         return Speed(1.0, None, 1, (64, 80), "here")
 
     monkeypatch.setattr(gelflow.compare.run, "network_speed", kept)
-    method = Learned(own, "net", device="cpu")
+    method = Learned(own, MethodName("net"), device="cpu")
     compare([method], dataset)
     np.testing.assert_array_equal(np.moveaxis(measured[0], 0, -1), method.flow(*dataset.images(0)))
 

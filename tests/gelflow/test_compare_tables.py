@@ -16,18 +16,22 @@ from gelflow.compare.dots import Dots, dot_distance, find_dots
 from gelflow.compare.metrics import closure
 from gelflow.compare.run import compare, latex
 from gelflow.compare.scores import evaluate, summarise
-from gelflow.compare.seeds import group_name, grouped
+from gelflow.compare.seeds import grouped
 from gelflow.compare.strata import EDGE, MOTION, PATTERN, SCENE, merged, pair_strata, signed_distance
 from gelflow.compare.tables import EXPLAINED, pair_table, strata_table, summary_table, tables
 from gelflow.data import PairDataset
+from gelflow.data.record import PatternedScene
 from gelflow.files.image import read_image
+from gelflow.methods.name import MethodName
 
 PITCH = 24.0
 
 
 def test_seeds_become_mean_and_standard_deviation(tmp_path: Path) -> None:
-    names = ["best#0", "best#12+ft", "best", "C# code", "a#1b", "x#2#3"]
-    assert [group_name(name) for name in names] == ["best", "best+ft", "best", "C# code", "a#1b", "x#2"]
+    named = {"best#0": "best", "best#12+ft": "best+ft", "best": "best",
+              "C# code": "C# code", "a#007": "a", "a#1b": "a#1b", "x#2#3": "x#2"}  # fmt: skip
+    assert {text: str(MethodName.parse(text).group) for text in named} == named
+    assert [str(MethodName.parse(text)) for text in named] == list(named)
     dataset = PairDataset(write_synthetic(tmp_path, [(1.0, 0.0), (2.0, 0.0)]))
     methods = [Constant("net#0", 0, 0), Constant("other", 5, 0), Constant("net#1", 0.5, 0), Constant("net#2", 1, 0)]
     scores = [score for method in methods for score in evaluate(method, dataset)]
@@ -49,7 +53,7 @@ def test_bins_of_seeds_are_pooled_and_fine_tuned_methods_and_other_devices_come_
     named = [[row[0] for row in rows] for _, (_, rows) in tables(result)]
     assert named == [["net"], ["net+ft"], ["net", "net+ft"], ["net", "net+ft"]]  # PSNR and closure of each pair
     here = replace(result.scores[1], seconds=2.0, processor_seconds=0.5)
-    elsewhere = replace(here, method="net, GPU", device="NVIDIA H200", on_gpu=True)
+    elsewhere = replace(here, method=MethodName("net, GPU"), device="NVIDIA H200", on_gpu=True)
     means = summarise([here, elsewhere])
     header, rows = summary_table(grouped(means))
     assert (header[-1], rows[1][-1]) == ("on", "NVIDIA H200")
@@ -91,7 +95,7 @@ def test_bins_hold_every_compared_pixel_once() -> None:
     error, compared = generator.exponential(0.4, (20, 30)), generator.random((20, 30)) < 0.8
     contact = np.zeros((20, 30), bool)
     contact[5:15, 8:20] = True
-    strata = pair_strata(error, truth, compared, contact, "gelsight, speckle")
+    strata = pair_strata(error, truth, compared, contact, PatternedScene("gelsight", "speckle"))
     counted = error[compared]
     for kind in (MOTION, EDGE, PATTERN, SCENE):
         mine = [(s.pixels, s.error_px, s.above_1px, s.above_01px) for s in strata if s.kind == kind]
@@ -150,7 +154,7 @@ def test_bare_gels_are_left_out_of_a_second_table_of_means(tmp_path: Path) -> No
     """Nothing can be followed on a gel without a pattern, whose errors would hide all others."""
     dataset = PairDataset(with_contact(tmp_path, DRAWN_KIND))  # a pair moves by 3 px, the other by 0.25 px
     first = dataset.records[0]
-    bare = PairDataset(dataset.source, [replace(first, scene="toy, none"), *dataset.records[1:]])
+    bare = PairDataset(dataset.source, [replace(first, scene=PatternedScene("toy", "none")), *dataset.records[1:]])
     result = compare([Constant("zero", 0, 0)], bare)
     found = {title: rows for title, (_, rows) in tables(result) if title.startswith("Means")}
     assert [rows[0][3] for rows in found.values()] == ["1.625", "0.250"]

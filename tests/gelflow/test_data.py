@@ -1,5 +1,6 @@
 """Images, flow files and data sets of every kind, whole and broken; those of synth as synth writes them."""
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -152,6 +153,14 @@ def test_digest_tells_scene_and_seed_and_flow_of_another_size_is_named(tmp_path:
         digests.append(PairDataset(folder).digest)
     assert len(set(digests)) == 4
     assert PairDataset(folder).digest == digests[-1]
+    # Runs of training keep the digest and compare it when they are resumed: its text is a format.
+    known = json.dumps([["000000", None, "b, 2"]])
+    assert digests[-1] == hashlib.sha256(known.encode()).hexdigest()
+    scene = {"name": "toy", "sensor": {"pattern": {"kind": "none"}}}
+    (folder / "dataset.json").write_text(json.dumps({"schema_version": 1, "scene": scene}))
+    assert PairDataset(folder)[0]["bare"] is True
+    known = json.dumps([["000000", "toy, none", None]])
+    assert PairDataset(folder).digest == hashlib.sha256(known.encode()).hexdigest()
     write_flow(folder / "samples" / "000000" / "flow.exr", np.zeros((10, 10, 2), np.float32))
     refused(r"flow\.exr.*10 x 10.*80 x 64", PairDataset(folder).__getitem__, 0)
     with pytest.raises(IndexError, match=r"there is no pair 9: .* has 1"):

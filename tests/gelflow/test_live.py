@@ -22,10 +22,10 @@ from gelflow.baselines import named_methods
 from gelflow.cli import main
 from gelflow.cli.prediction import show_live
 from gelflow.errors import InputError
-from gelflow.fast.method import Fast
 from gelflow.files import video as video_files
 from gelflow.files.exr import read_flow
 from gelflow.files.video import newest_frames
+from gelflow.methods.fast import Fast
 from gelflow.predict.live import LiveFlow, Pace, follow
 from gelflow.predict.page import Page
 from gelflow.predict.prediction import motion_of

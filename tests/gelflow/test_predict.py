@@ -14,11 +14,11 @@ from textures import as_bytes, moved, save, table, write_folder, write_synthetic
 
 import gelflow
 from gelflow.baselines import named_methods
-from gelflow.baselines.learned import Learned
 from gelflow.data.open import holds_pairs
 from gelflow.data.pairs import PairDataset
 from gelflow.files.exr import read_flow
 from gelflow.files.video import VideoInfo, describe
+from gelflow.methods.learned import Learned
 from gelflow.models.uncertainty import UNKNOWN_PX
 from gelflow.models.weights import weights_file
 from gelflow.predict import pictures

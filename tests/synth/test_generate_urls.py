@@ -18,7 +18,7 @@ from synth.dataset.lock import EXPIRES_S
 from synth.dataset.manifest import Failure
 from synth.dataset.sample_files import write_sample_files
 from synth.dataset.shard import Shard
-from synth.dataset.store import Store, mesh_folder
+from synth.dataset.store import RemoteStore, open_store
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, generate
@@ -58,7 +58,7 @@ def test_a_stopped_run_leaves_a_journal_that_the_next_one_reads(url: str) -> Non
     writer.fail(Failure(1, 0, "simulate", "Newton failed"))
     write_sample_files(url, translation_sample(0), job())  # without its line: does not count
     writer.close()  # as a killed run, nothing finalised; but its lease is this process's, which lives
-    store = Store(url)
+    store = RemoteStore(url)
     assert store.names("journal") == ["000001-0.json", "000002.json"]
     assert store.read("manifest.jsonl") is None
     with DatasetWriter(url, job(3)) as again:
@@ -72,6 +72,24 @@ def test_a_stopped_run_leaves_a_journal_that_the_next_one_reads(url: str) -> Non
     assert len((store.read("failures.jsonl") or b"").splitlines()) == 1
 
 
+def test_lines_that_cannot_be_published_stay_in_the_journal(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise RuntimeError("403 Forbidden")
+
+    writer = DatasetWriter(url, job(1))
+    writer.record(write_sample_files(url, translation_sample(0), job()))
+    writer.run = {}
+    with monkeypatch.context() as patch:
+        patch.setattr(MemoryFileSystem, "put_file", refuse)
+        refused(r"manifest\.jsonl: the storage refuses: RuntimeError: 403", writer.finalise)
+    writer.close()
+    assert RemoteStore(url).names("journal") == ["000000.json"]
+    with DatasetWriter(url, job(1)) as again:
+        assert again.finished == {0}
+    assert RemoteStore(url).names("journal") == []
+    assert len((RemoteStore(url).read("manifest.jsonl") or b"").splitlines()) == 1
+
+
 def test_who_is_refused(url: str) -> None:
     with DatasetWriter(url, job()):
         for shard in (None, Shard(0, 2)):
@@ -80,7 +98,7 @@ def test_who_is_refused(url: str) -> None:
         for shard in (None, Shard(1, 2)):
             refused("another process", DatasetWriter, url, job(), shard)
     refused("seed: 7 there, 8 now", DatasetWriter, url, job(seed=8))
-    Store(url).delete(["dataset.json"])
+    RemoteStore(url).delete(["dataset.json"])
     refused(r"holds .* but no dataset", DatasetWriter, url, job())
 
 
@@ -91,9 +109,9 @@ def test_meshes_are_put_under_the_url_but_not_by_a_shard(url: str) -> None:
         (folder / "shard.npz").unlink()
     with DatasetWriter(url, job()) as writer, writer.making_meshes() as folder:
         (folder / "plain.npz").write_bytes(b"mesh")
-    assert Store(url).names("meshes") == ["plain.npz"]
+    assert RemoteStore(url).names("meshes") == ["plain.npz"]
     (folder / "plain.npz").unlink()
-    assert (mesh_folder(url) / "plain.npz").read_bytes() == b"mesh"  # fetched by another process
+    assert (open_store(url).meshes() / "plain.npz").read_bytes() == b"mesh"  # fetched by another process
 
 
 @pytest.mark.parametrize("place", ["url", "tmp_path"])
@@ -110,9 +128,9 @@ def test_a_killed_run_holds_nothing_for_long(url: str) -> None:
     dead = {"pid": 2**22 + 1, "host": os.uname().nodename, "time": time.time()}  # beyond Linux's largest number
     DatasetWriter(url, job()).close()
     for note in (expired, dead):
-        Store(url).write("leases/whole.json", json.dumps(note).encode())
+        RemoteStore(url).write("leases/whole.json", json.dumps(note).encode())
         with DatasetWriter(url, job()):  # taken over
-            assert json.loads(Store(url).read("leases/whole.json") or b"{}")["pid"] == os.getpid()
+            assert json.loads(RemoteStore(url).read("leases/whole.json") or b"{}")["pid"] == os.getpid()
 
 
 def test_storage_that_refuses_ends_with_one_message_and_goes_on(url: str, tiny: Path, tmp_path, monkeypatch) -> None:

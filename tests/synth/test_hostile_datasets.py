@@ -22,7 +22,7 @@ from synth.dataset.exr import write_flow
 from synth.dataset.images import read_png
 from synth.dataset.lock import EXPIRES_S, Lease
 from synth.dataset.sample_reader import read_sample
-from synth.dataset.store import Store
+from synth.dataset.store import RemoteStore
 from synth.errors import printable
 from synth.flow.field import FlowField
 from synth.scene.template import MOST_OPTIONS, load_scene
@@ -232,7 +232,7 @@ def test_a_dataset_whose_parts_are_links_is_not_written(sound: Path, tmp_path: P
 
 @pytest.mark.parametrize(("ahead_s", "held"), [(0.5 * EXPIRES_S, True), (2 * EXPIRES_S, False), (1e300, False)])
 def test_a_lease_of_the_future_is_none(ahead_s: float, held: bool) -> None:
-    store = Store(f"memory://lease-{hashlib.sha256(repr(ahead_s).encode()).hexdigest()}")
+    store = RemoteStore(f"memory://lease-{hashlib.sha256(repr(ahead_s).encode()).hexdigest()}")
     note = {"pid": 1, "host": "elsewhere", "time": time.time() + ahead_s}
     store.write("leases/whole.json", json.dumps(note).encode())
     lease = Lease(store)

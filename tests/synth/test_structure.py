@@ -90,7 +90,7 @@ def test_every_module_has_a_stage_and_imports_only_from_earlier_ones() -> None:
 
 ROOMS = (
     "errors", "arrays", "untrusted", "hardware", "terminal", "config", "files", "ops", "models", "losses", "data",
-    "fast", "baselines", "track", "predict", "compare", "training", "cli", "__main__",
+    "fast", "methods", "baselines", "track", "predict", "compare", "training", "cli", "__main__",
 )  # fmt: skip
 """The same for the parts of gelflow."""
 
@@ -101,6 +101,17 @@ def test_gelflow_imports_only_from_earlier_parts() -> None:
     parts = [pair for pair in parts if pair[1] != "__version__"]
     assert [pair for pair in parts if ROOMS.index(pair[1]) > ROOMS.index(pair[0])] == []
     assert {imported for _, imported in parts} == set(ROOMS[:-1]), "a finder that sees nothing would pass always"
+
+
+def test_networks_need_no_baseline_baselines_no_weights_and_the_writer_no_kind_of_store() -> None:
+    gelflow, synth = _imports_of(GELFLOW), _imports_of(SYNTH)
+    ours = ("gelflow.methods", "gelflow.predict", "gelflow.track")
+    assert [pair for pair in gelflow if pair[0].startswith(ours) and pair[1].startswith("gelflow.baselines")] == []
+    weights = ("gelflow.methods.learned", "gelflow.models.weights", "gelflow.models.raft")
+    assert [pair for pair in gelflow if pair[0].startswith("gelflow.baselines") and pair[1].startswith(weights)] == []
+    kinds = {f"synth.dataset.store.{name}Store" for name in ("Directory", "Remote")} | {"synth.dataset.objects"}
+    askers = {name for name, imported in synth if imported in kinds}
+    assert askers == {"synth.dataset.store", "synth.dataset.lines", "synth.dataset.lock"}
 
 
 @pytest.mark.parametrize(("modules", "forbidden"), [
@@ -135,7 +146,7 @@ def test_prediction_loads_nothing_of_training_simulate_no_renderer_and_preview_n
     tmp_path: Path, monkeypatch
 ) -> None:
     code = """
-import gelflow.predict.prediction, gelflow.baselines.learned, gelflow.compare.run, sys
+import gelflow.predict.prediction, gelflow.methods.learned, gelflow.compare.run, sys
 from gelflow.models.weights import load_weights, weights_file
 load_weights(weights_file(None))
 print(*sys.modules)"""

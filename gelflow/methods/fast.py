@@ -13,15 +13,16 @@ from gelflow.fast.certainty import refined
 from gelflow.fast.registration import STAGES, Prepared, register
 from gelflow.fast.start import fresh_start
 from gelflow.files.image import check_images
+from gelflow.methods.name import MethodName
 
 FAST = "fast"
 """Its name where weights are named."""
 
 
 class Fast:
-    """A method (`gelflow.baselines.method.Method`) that also says how certain its flow is."""
+    """A method (`gelflow.methods.method.Method`) that also says how certain its flow is."""
 
-    name = FAST
+    name = MethodName(FAST)
     device = "cpu"
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:

@@ -5,13 +5,11 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from gelflow.arrays import Estimate, FlowArray, ImageArray, MapArray
-from gelflow.errors import InputError
 from gelflow.fast.certainty import doubted
-from gelflow.fast.method import Fast
-from gelflow.files.exr import FlowField
+from gelflow.methods.fast import Fast
+from gelflow.methods.name import MethodName
 from gelflow.models.working_size import sized_sigma, working_sizes
 
 
@@ -19,7 +17,7 @@ class Method(Protocol):
     """Estimates the flow from image 1 to image 2: ``I1(x) = I2(x + flow(x))``."""
 
     @property
-    def name(self) -> str:
+    def name(self) -> MethodName:
         """Name in tables."""
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
@@ -61,45 +59,3 @@ def estimated(method: Method, image1: ImageArray, image2: ImageArray) -> tuple[E
     flow = method.flow(image1, image2)
     seconds = time.perf_counter() - started
     return Estimate(flow, *uncertainty(flow, image1, image2, getattr(method, "device", "cpu"))), seconds
-
-
-class ExactFlow:
-    """The data set's own exact flow as a row of the comparison: what PSNR and SSIM say of the truth.
-
-    Its endpoint error is zero by definition. Neither is its PSNR infinite nor its SSIM 1: image 2 has noise and shading
-    of its own, and hides a part of image 1. A method with a higher PSNR has followed those, too, not the gel alone.
-    """
-
-    name = "exact flow"
-
-    def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        """Always raises InputError: images alone do not tell."""
-        raise InputError("the exact flow cannot be estimated from images; it is a row of `compare` on synthetic pairs")
-
-    def of(self, truth: FlowField | None) -> FlowArray:
-        """The true flow (H, W, 2) px, zero where no gel is seen; InputError where the pair has none."""
-        if truth is None:
-            raise InputError("the pair has no exact flow; leave the method exact out")
-        return np.nan_to_num(truth.flow)
-
-
-def dense_flow(points: NDArray[np.float64], motion: NDArray[np.float64], height: int, width: int) -> FlowArray:
-    """A dense flow (height, width, 2) float32 px, finite everywhere, from motions at scattered points.
-
-    Points are (N, 2) columns and rows as pixel indices, N >= 1, their motions (N, 2) px. Inside the points' convex
-    hull: Clough and Tocher's piecewise cubic on the Delaunay triangulation, continuous with its first derivatives,
-    gradients chosen for least curvature (SciPy). Outside: the motion of the nearest point. With fewer than four points,
-    or all of them on a line, there are no triangles: the nearest point everywhere.
-    """
-    from scipy.interpolate import CloughTocher2DInterpolator, NearestNDInterpolator
-    from scipy.spatial import QhullError
-
-    columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    flow = np.asarray(NearestNDInterpolator(points, motion)(columns, rows))
-    if len(points) >= 4:
-        try:
-            smooth = np.asarray(CloughTocher2DInterpolator(points, motion)(columns, rows))
-        except QhullError:  # all points on a line
-            return flow.astype(np.float32)
-        flow = np.where(np.isfinite(smooth), smooth, flow)
-    return flow.astype(np.float32)

@@ -1,31 +1,29 @@
 """Networks with weights from a file behind the interface of all methods: GelFlow's own, and RAFT's published ones."""
 
-import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from gelflow.arrays import FlowArray, ImageArray
-from gelflow.baselines.method import as_array, as_tensor
 from gelflow.config import REGISTRATIONS, Registration
 from gelflow.errors import InputError
-from gelflow.fast.method import Fast, fast, is_fast
 from gelflow.files.image import check_images
 from gelflow.hardware import chosen_device
+from gelflow.methods.fast import Fast, fast, is_fast
+from gelflow.methods.method import as_array, as_tensor
+from gelflow.methods.name import MethodName
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.raft import load_raft, looks_like_raft
 from gelflow.models.recorded import RecordedNetwork
 from gelflow.models.weights import load_weights
 from gelflow.ops.pyramid import resize_flow, resize_images
 
-_END = re.compile(r"((?:#\d+)?(?:\+ft)?)$")
-"""The number of a seed and the mark of fine-tuning, which names end with (see `gelflow.compare.seeds`)."""
-
 
 def open_network(
     path: Path,
-    name: str | None = None,
+    name: MethodName | None = None,
     size: tuple[int, int] | None = None,
     device: str = "auto",
     registration: Registration | None = None,
@@ -49,8 +47,8 @@ class Learned:
 
     Args:
         path: Weights, as `gelflow train` writes them.
-        name: Name in tables; None: the name of the file's folder and file. Where the flow is registered and the name
-            does not say so, "+motion", "+both" or "+brightness" is added in front of a seed's number and of "+ft".
+        name: Name in tables; None: the name of the file's folder and file. How the flow is registered is added where
+            the label does not say so.
         size: Rows and columns at which the network works; None: those of its training, or those of
             `gelflow.models.working_size`.
         device: "auto" (a CUDA device where there is one), "cpu" or "cuda".
@@ -58,7 +56,6 @@ class Learned:
 
     Attributes:
         forward: What `flow` costs beside reading and resizing, of tensors (B, 3, H, W) on the device.
-        label: The name without what is added to it.
         trained: The architecture as the file has it, its own registration included.
 
     Raises:
@@ -68,7 +65,7 @@ class Learned:
     def __init__(
         self,
         path: Path,
-        name: str | None = None,
+        name: MethodName | None = None,
         size: tuple[int, int] | None = None,
         device: str = "auto",
         registration: Registration | None = None,
@@ -85,10 +82,11 @@ class Learned:
         if registration is not None:
             self.model.config = self.trained.model_copy(update={"registration": REGISTRATIONS[registration]})
         self.forward = RecordedNetwork(self.model)
-        self.label = name or "/".join(path.with_suffix("").parts[-2:])
-        known = (name for name, config in REGISTRATIONS.items() if config == self.model.config.registration)
-        added = f"+{next(known, 'registration')}".replace("+none", "")
-        self.name = self.label if added in self.label else _END.sub(rf"{added}\1", self.label, count=1)
+        name = name or MethodName.parse("/".join(path.with_suffix("").parts[-2:]))
+        known = (aim for aim, config in REGISTRATIONS.items() if config == self.model.config.registration)
+        aim = next(known, "registration")
+        stated = aim == "none" or f"+{aim}" in name.label
+        self.name = replace(name, registration="" if stated else aim)
         self.size = size
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
@@ -101,11 +99,11 @@ class Learned:
 class PublishedRaft:
     """RAFT, small or large, with published weights; arguments and exceptions as for `Learned`."""
 
-    def __init__(self, path: Path, name: str | None, size: tuple[int, int] | None, device: str) -> None:
+    def __init__(self, path: Path, name: MethodName | None, size: tuple[int, int] | None, device: str) -> None:
         self.device = chosen_device(device)
         self.model: Any = load_raft(path, self.device)
         self.forward = self.model
-        self.name = name or f"RAFT {'large' if self.model.large else 'small'}"
+        self.name = name or MethodName(f"RAFT {'large' if self.model.large else 'small'}")
         self.size = size
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
