@@ -1,39 +1,26 @@
 """Flow of pairs of images or of a video, written as EXR, Middlebury .flo and pictures."""
 
-import os
-import re
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.arrays import Bytes3, Estimate, FlowArray, Frame
+from gelflow.arrays import Estimate, FlowArray, Frame
 from gelflow.data.pairs import PairDataset
 from gelflow.data.record import PairRecord
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, write_csv
-from gelflow.files.exr import DIRECTIONS, read_flow, write_flo, write_flow
-from gelflow.files.image import full_range, in_unit_range, to_bytes
-from gelflow.files.quiet import quiet
+from gelflow.files.exr import DIRECTIONS, write_flo, write_flow
 from gelflow.files.video import describe, frame_file, frames, image_files
 from gelflow.methods.method import Method, estimated
 from gelflow.models.working_size import unknown_px
-from gelflow.predict.pictures import certain, draw_overlay, robust_scale, write_flow_picture
+from gelflow.predict.outputs import MARKERS, MOTIONS, MOTIONS_BEGIN, earlier_flows, flow_file, write_overlay
+from gelflow.predict.pictures import certain, robust_scale, write_flow_picture
 from gelflow.predict.stream import Indexed, Reference, followed
 from gelflow.track.markers import marker_rows, marker_table
-
-MAX_RATE = 600.0
-"""Largest number of frames per second of an overlay."""
-MOTIONS, MOTIONS_BEGIN = "motion.csv", b"mean_px,p95_px"
-"""The table of motions, and what tells it from other tables."""
-MARKERS, MARKERS_BEGIN = "markers.csv", b"id,frame,time_s,x"
-"""The table of markers, likewise."""
 
 
 @dataclass(frozen=True)
@@ -145,11 +132,7 @@ def predict_video(
     if expected < 1:
         words = f"takes one of the {info.frames} frames, a flow needs two; allowed are 1 to {info.frames - 1}"
         raise InputError(f"{path}: every = {every} {words}")
-    video = out / "overlay.mp4"
-    refuse_foreign(out / MOTIONS, MOTIONS_BEGIN, video)
-    refuse_foreign(out / MARKERS, MARKERS_BEGIN)
-    for earlier in earlier_flows(out):
-        refuse_foreign(earlier, DIRECTIONS.encode())
+    former = earlier_flows(out)
     sources = dict(enumerate(image_files(path))) if path.is_dir() else {}
     files: list[Path] = []
     motions: list[Motion] = []
@@ -170,7 +153,7 @@ def predict_video(
         if moved is not None:
             marked.append((index, time_s, moved))
         if not files:
-            for earlier in earlier_flows(out):
+            for earlier in former:
                 earlier.unlink()
         files.append(flow_file(out, index))
         write_flow(files[-1], found.flow, found.visible, found.sigma)
@@ -186,18 +169,12 @@ def predict_video(
     elif (out / MARKERS).exists():
         (out / MARKERS).unlink()
 
-    def overlays() -> Iterator[Bytes3]:
-        for count, (index, _, frame) in enumerate(_frames(path, every), len(motions)):
-            flow = np.zeros((*frame.shape[:2], 2), np.float32)
-            if index > 0:
-                field = read_flow(flow_file(out, index))
-                flow = certain(field.flow, field.sigma)
-            image = in_unit_range(frame)
-            yield draw_overlay(to_bytes(full_range(image, image)[0]), flow, scale)
-            if progress and index > 0:
-                progress(count, 2 * expected)
+    def drawn(index: int) -> None:
+        if progress and index > 0:
+            progress(len(motions) + index // every, 2 * expected)
 
-    _write_overlay(overlays(), video, *_places(times, info.frames_per_second / every))
+    taken = ((index, frame) for index, _, frame in _frames(path, every))
+    video = write_overlay(out, taken, times, info.frames_per_second / every, scale, drawn)
     return Prediction([*files, *tables, video], motions, info.lost)
 
 
@@ -215,50 +192,3 @@ def _frames(path: Path, every: int) -> Iterator[tuple[int, float | None, Frame]]
         if frame is None:
             raise InputError(f"{frame_file(path, index)}: cannot be read (truncated or damaged)")
         yield index, time_s, frame
-
-
-def _places(times: list[float], frames_per_second: float) -> tuple[list[int], float]:
-    """Numbers of the frames in a video of a constant rate, and the rate, as fine as keeps the frames apart.
-
-    OpenCV writes no time stamps. MPEG-4 takes no rates above `MAX_RATE`, and no finer fractions.
-    """
-    while True:
-        rate = round(min(max(frames_per_second, 1.0), MAX_RATE), 2)
-        places = [round((time_s - times[0]) * rate) for time_s in times]
-        if frames_per_second >= MAX_RATE or all(one < other for one, other in pairwise(places)):
-            return places, rate
-        frames_per_second *= 2
-
-
-def _write_overlay(pictures: Iterator[Bytes3], video: Path, places: list[int], rate: float) -> None:
-    """Writes a video in which each picture stays until the place of the next."""
-    temporary = video.with_name(".overlay.part.mp4")
-    writer: Any = None  # OpenCV has no types
-    try:
-        for picture, place, following in zip(pictures, places, [*places[1:], places[-1] + 1], strict=True):
-            if writer is None:
-                size = (picture.shape[1], picture.shape[0])
-                with quiet():
-                    writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
-            for _ in range(place, following):
-                writer.write(np.ascontiguousarray(picture[..., ::-1]))
-        with quiet():
-            writer.release()
-        count, arrived = places[-1] + 1, 0
-        with suppress(InputError):  # OpenCV does not report a failed write (a full disk): count what arrived
-            arrived = describe(temporary).frames
-        if arrived != count:
-            raise OSError(f"cannot write {video}: the encoder did not take all {count} frames (is the disk full?)")
-        os.replace(temporary, video)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def flow_file(out: Path, index: int) -> Path:
-    """The file of the flow to a frame."""
-    return out / "flow" / f"{index:06d}.exr"
-
-
-def earlier_flows(out: Path) -> list[Path]:
-    """What an earlier run wrote, which may have had other frames: files named by six digits or more."""
-    return [path for path in (out / "flow").glob("*.exr") if re.fullmatch(r"[0-9]{6,}", path.stem)]
