@@ -1,10 +1,15 @@
 """Flow of pairs of images or of a video, written as EXR, Middlebury .flo and pictures."""
 
-from collections.abc import Callable, Iterator
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,14 +18,23 @@ from gelflow.data.pairs import PairDataset
 from gelflow.data.record import PairRecord
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, write_csv
-from gelflow.files.exr import DIRECTIONS, write_flo, write_flow
+from gelflow.files.exr import DIRECTIONS, read_flow, write_flo, write_flow
+from gelflow.files.image import full_range, in_unit_range, to_bytes
+from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
 from gelflow.methods.method import Method, estimated
 from gelflow.models.working_size import unknown_px
-from gelflow.predict.outputs import MARKERS, MOTIONS, MOTIONS_BEGIN, earlier_flows, flow_file, write_overlay
-from gelflow.predict.pictures import certain, robust_scale, write_flow_picture
+from gelflow.predict.pictures import certain, draw_overlay, robust_scale, write_flow_picture
 from gelflow.predict.stream import Indexed, Reference, followed
 from gelflow.track.markers import marker_rows, marker_table
+
+MAX_RATE = 600.0
+"""Largest number of frames per second of an overlay."""
+MOTIONS, MOTIONS_BEGIN = "motion.csv", b"mean_px,p95_px"
+"""The table of motions, and what tells it from other tables."""
+MARKERS, MARKERS_BEGIN = "markers.csv", b"id,frame,time_s,x"
+"""The table of markers, likewise."""
+OVERLAY = "overlay.mp4"
 
 
 @dataclass(frozen=True)
@@ -118,10 +132,9 @@ def predict_video(
 
     Every `every`-th frame of a video file or a folder of images is taken; the flow leads to it from the first one or
     from its predecessor. With `markers`, markers.csv holds those of the first frame in each other, in mm where `places`
-    (`gelflow.track.places`) are given. `progress` is called
-    with the number of frames done and to be done; each counts twice, for flow and overlay. InputError where the video
-    does not open, fewer than two frames decode, a frame cannot be used, or files of these names are somebody else's;
-    OSError where a file cannot be written.
+    (`gelflow.track.places`) are given. `progress` is called with the number of frames done and to be done; each counts
+    twice, for flow and overlay. InputError where the video does not open, fewer than two frames decode, a frame cannot
+    be used, or files of these names are somebody else's; OSError where a file cannot be written.
     """
     if every < 1:
         raise InputError(f"every = {every}: at least 1 is needed")
@@ -132,7 +145,7 @@ def predict_video(
     if expected < 1:
         words = f"takes one of the {info.frames} frames, a flow needs two; allowed are 1 to {info.frames - 1}"
         raise InputError(f"{path}: every = {every} {words}")
-    former = earlier_flows(out)
+    former = earlier_files(out)
     sources = dict(enumerate(image_files(path))) if path.is_dir() else {}
     files: list[Path] = []
     motions: list[Motion] = []
@@ -166,15 +179,14 @@ def predict_video(
         rows = (row for index, time_s, moved in marked for row in marker_rows(index, time_s, moved, places))
         write_csv(out / MARKERS, marker_table(places), rows)
         tables.append(out / MARKERS)
-    elif (out / MARKERS).exists():
-        (out / MARKERS).unlink()
 
-    def drawn(index: int) -> None:
-        if progress and index > 0:
-            progress(len(motions) + index // every, 2 * expected)
+    def drawn() -> Iterator[tuple[int, Frame]]:
+        for index, _, frame in _frames(path, every):
+            yield index, frame
+            if progress and index > 0:
+                progress(len(motions) + index // every, 2 * expected)
 
-    taken = ((index, frame) for index, _, frame in _frames(path, every))
-    video = write_overlay(out, taken, times, info.frames_per_second / every, scale, drawn)
+    video = write_overlay(out, drawn(), times, info.frames_per_second / every, scale)
     return Prediction([*files, *tables, video], motions, info.lost)
 
 
@@ -192,3 +204,68 @@ def _frames(path: Path, every: int) -> Iterator[tuple[int, float | None, Frame]]
         if frame is None:
             raise InputError(f"{frame_file(path, index)}: cannot be read (truncated or damaged)")
         yield index, time_s, frame
+
+
+def write_overlay(
+    out: Path, frames: Iterable[tuple[int, Frame]], times: list[float], frames_per_second: float, scale_px: float
+) -> Path:
+    """Writes a video of numbered frames with the flow to each, which is read from its file; frame 0 has none.
+
+    Each frame stays until the time of the next. OSError where the video cannot be written.
+    """
+    video, temporary = out / OVERLAY, out / ".overlay.part.mp4"
+    places, rate = _places(times, frames_per_second)
+    writer: Any = None  # OpenCV has no types
+    try:
+        for (index, frame), place, following in zip(frames, places, [*places[1:], places[-1] + 1], strict=True):
+            flow = np.zeros((*frame.shape[:2], 2), np.float32)
+            if index > 0:
+                field = read_flow(flow_file(out, index))
+                flow = certain(field.flow, field.sigma)
+            image = in_unit_range(frame)
+            picture = draw_overlay(to_bytes(full_range(image, image)[0]), flow, scale_px)
+            if writer is None:
+                size = (picture.shape[1], picture.shape[0])
+                with quiet():
+                    writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+            for _ in range(place, following):
+                writer.write(np.ascontiguousarray(picture[..., ::-1]))
+        with quiet():
+            writer.release()
+        count, arrived = places[-1] + 1, 0
+        with suppress(InputError):  # OpenCV does not report a failed write (a full disk): count what arrived
+            arrived = describe(temporary).frames
+        if arrived != count:
+            raise OSError(f"cannot write {video}: the encoder did not take all {count} frames (is the disk full?)")
+        os.replace(temporary, video)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return video
+
+
+def _places(times: list[float], frames_per_second: float) -> tuple[list[int], float]:
+    """Numbers of the frames in a video of a constant rate, and the rate, as fine as keeps the frames apart.
+
+    OpenCV writes no time stamps. MPEG-4 takes no rates above `MAX_RATE`, and no finer fractions.
+    """
+    while True:
+        rate = round(min(max(frames_per_second, 1.0), MAX_RATE), 2)
+        places = [round((time_s - times[0]) * rate) for time_s in times]
+        if frames_per_second >= MAX_RATE or all(one < other for one, other in pairwise(places)):
+            return places, rate
+        frames_per_second *= 2
+
+
+def flow_file(out: Path, index: int) -> Path:
+    """The file of the flow to a frame."""
+    return out / "flow" / f"{index:06d}.exr"
+
+
+def earlier_files(out: Path) -> list[Path]:
+    """Flows and markers that an earlier run left; InputError where a file that a run replaces is somebody else's."""
+    flows = [path for path in (out / "flow").glob("*.exr") if re.fullmatch(r"[0-9]{6,}", path.stem)]
+    refuse_foreign(out / MOTIONS, MOTIONS_BEGIN, out / OVERLAY)
+    refuse_foreign(out / MARKERS, MARKERS_BEGIN)
+    for flow in flows:
+        refuse_foreign(flow, DIRECTIONS.encode())
+    return [path for path in (*flows, out / MARKERS) if path.exists()]

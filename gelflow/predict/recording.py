@@ -17,14 +17,11 @@ import numpy as np
 from gelflow.arrays import Bytes3, Estimate, Frame
 from gelflow.files.exr import write_flow
 from gelflow.files.video import NOMINAL_RATE
-from gelflow.predict.outputs import MARKERS, MOTIONS, earlier_flows, flow_file, write_overlay
 from gelflow.predict.pictures import certain, robust_scale
-from gelflow.predict.prediction import MOTION_COLUMNS, Motion
+from gelflow.predict.prediction import MOTION_COLUMNS, MOTIONS, Motion, earlier_files, flow_file, write_overlay
 from gelflow.terminal import progress
 
 MOST_PENDING = 8
-QUALITY = 95
-"""Of the frames as JPEG."""
 
 
 class Recording:
@@ -34,8 +31,8 @@ class Recording:
     """
 
     def __init__(self, out: Path) -> None:
-        for earlier in [*earlier_flows(out), out / MARKERS]:
-            earlier.unlink(missing_ok=True)
+        for earlier in earlier_files(out):
+            earlier.unlink()
         out.mkdir(parents=True, exist_ok=True)
         self._out, self._table = out, (out / MOTIONS).open("w", newline="", encoding="utf-8")
         csv.writer(self._table).writerow(MOTION_COLUMNS)
@@ -57,22 +54,23 @@ class Recording:
                 for each in self._pending:
                     each.result()
             if self._kept:
-                times, last = [time_s for _, time_s, _ in self._kept], self._kept[-1][0]
+                times = [time_s for _, time_s, _ in self._kept]
                 rate = float(1 / np.median(np.diff(times))) if len(times) > 1 else NOMINAL_RATE
-                with progress("overlay (Ctrl-C leaves it out)") as advance:
-                    write_overlay(self._out, self._read(), times, rate, self._scale_px, lambda n: advance(n, last, ""))
+                write_overlay(self._out, self._shown(), times, rate, self._scale_px)
 
     def _write(self, frame: Bytes3, found: Estimate, motion: Motion) -> None:
         write_flow(flow_file(self._out, motion.frame), found.flow, found.visible, found.sigma)
         csv.writer(self._table).writerow(astuple(motion))
         self._table.flush()
-        _, jpeg = cv2.imencode(".jpg", frame[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, QUALITY))
+        _, jpeg = cv2.imencode(".jpg", frame[..., ::-1])
         self._kept.append((motion.frame, motion.time_s or 0.0, self._frames.write(jpeg)))
         self._scale_px = max(self._scale_px, robust_scale(certain(found.flow, found.sigma)))
 
-    def _read(self) -> Iterator[tuple[int, Frame]]:
+    def _shown(self) -> Iterator[tuple[int, Frame]]:
         """Numbers and pixels of the frames, in order."""
         self._frames.seek(0)
-        for number, _, size in self._kept:
-            jpeg = np.frombuffer(self._frames.read(size), np.uint8)
-            yield number, cv2.imdecode(jpeg, cv2.IMREAD_COLOR)[..., ::-1]
+        with progress("overlay (Ctrl-C leaves it out)") as advance:
+            for done, (number, _, size) in enumerate(self._kept):
+                advance(done, len(self._kept), "")
+                jpeg = np.frombuffer(self._frames.read(size), np.uint8)
+                yield number, cv2.imdecode(jpeg, cv2.IMREAD_COLOR)[..., ::-1]
