@@ -22,7 +22,8 @@ band, about the same. e stands for both.
 
 The powers were set by hand near those of free fits, which predict other trajectories hardly better; k was fitted
 (docs/reports/budget.md). Covered are flat pads of 2.5 to 16 mm and a dome, depths to 40 % of the thickness, friction of
-0.3 to 1, elements 0.4 to 2.7 b wide; all but one of the pads are incompressible.
+0.3 to 1, elements 0.4 to 2.7 b wide; all but one of the pads are incompressible. e was fitted to fewer presses
+(docs/reports/force_budget.md).
 """
 
 import numpy as np
