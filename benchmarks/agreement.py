@@ -34,7 +34,7 @@ from synth.sampling import draw, samples_of
 from synth.scene import Scene
 from synth.scene.template import Template, load_scene
 from synth.simulate import Trajectory
-from synth.simulate.batched.gemm import Host
+from synth.simulate.batched.gpu import Host
 from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.batched.run import OPTIONS, simulate_presses
 from synth.simulate.options import SolverOptions
@@ -92,7 +92,7 @@ class Noisy(Host):
         self._share, self._rng = np.float32(share), np.random.default_rng(0)
 
     def product(self, a: wp.array, x: wp.array, c: wp.array, wanted: wp.array) -> None:
-        """See `synth.simulate.batched.gemm.Dense`."""
+        """See `synth.simulate.batched.gpu.Dense`."""
         super().product(a, x, c, wanted)
         found = c.numpy()
         for s in np.flatnonzero(wanted.numpy() == 1):

@@ -28,7 +28,7 @@ from synth.press.press import Press
 from synth.press.resolution import graded_mesh
 from synth.scene import Scene
 from synth.simulate import simulate
-from synth.simulate.batched.gemm import dense
+from synth.simulate.batched.gpu import dense
 from synth.simulate.batched.krylov import RUNNING, WAITING
 from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.batched.run import OPTIONS, Run

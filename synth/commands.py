@@ -140,7 +140,7 @@ def simulate(
     as_json: AsJson = False,
 ) -> int:
     """Runs the finite-element simulation alone; renders nothing."""
-    from synth.dataset.storage import refuse_foreign, storage_errors
+    from synth.dataset.atomic_files import refuse_foreign, storage_errors
     from synth.press.press import MeshRule, as_pressed
     from synth.progress import progress
     from synth.sampling import draw
@@ -184,7 +184,7 @@ def inspect(
     as_json: AsJson = False,
 ) -> int:
     """Shows a dataset, a sample or a flow in numbers and pictures."""
-    from synth.dataset.storage import refuse_foreign
+    from synth.dataset.atomic_files import refuse_foreign
     from synth.inspect import PAGE_MARK, SHEET_MARK, tables, write_html, write_sheet
     from synth.inspect import inspect as look
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from synth.dataset.atomic_files import refuse_foreign, replace_file
 from synth.dataset.exr import write_channels
 from synth.dataset.images import Raster, encode_png
-from synth.dataset.storage import refuse_foreign, replace_file
 from synth.errors import InputError
 from synth.mesh import rest_surface
 from synth.optics import Optics

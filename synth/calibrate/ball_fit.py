@@ -152,14 +152,15 @@ def fit_balls(
         (fitted(first.geometry, min(steps, _SHORT), room, poses, first.vignetting), room),
         room.high - room.low,
     )
-    for known in (False, True):  # poses as the contacts' circles tell them, then as the best fit has them
-        poses = best[0].poses if known else poses
-        gels: list[LitGel | PressChange] = [gel, *(one(pose) for one, pose in zip(at, poses, strict=True))]
-        layout = chosen(gels, whole, first.geometry, shines, first.vignetting, room)
+    for known in (False, True):  # lights from all around; then the best ones, of which some may stand elsewhere
+        start = best[0] if known else first
+        at_poses = best[0].poses if known else poses
+        gels: list[LitGel | PressChange] = [gel, *(one(pose) for one, pose in zip(at, at_poses, strict=True))]
+        layout = chosen(gels, whole, start.geometry, shines, start.vignetting, room, fitted=known)
         low = np.maximum(layout.centre - reach / 2, [-np.inf, -np.inf, room.low[:, 2].min()])
         high = np.minimum(layout.centre + reach / 2, [np.inf, np.inf, room.high[:, 2].max()])
         limits = replace(room, low=low, high=high)
-        other = fitted(layout, min(steps, _SHORT), limits, poses, first.vignetting)
+        other = fitted(layout, min(steps, _SHORT), limits, at_poses, start.vignetting)
         best = min(best, (other, limits), key=lambda each: each[0].residual)
     fit = fitted(best[0].geometry, steps, best[1], best[0].poses, best[0].vignetting)
     again = fitted(clear(fit.geometry), 0, best[1], fit.poses, fit.vignetting)

@@ -2,8 +2,10 @@
 
 Lights of the preset's size and viewing angle are tried all around the gel, at several heights and tilts. What each of
 them adds is known, so that few are chosen one by one for what they explain, and then each once more given the others.
+Lights that are fitted may start this, so that one that stands at a wrong place is replaced and the others stay.
 """
 
+import dataclasses
 from itertools import product
 
 import numpy as np
@@ -44,16 +46,17 @@ def around(like: LightGeometry, room: Room) -> LightGeometry:
 
 
 def chosen(
-    gels: Gels, target: Target, like: LightGeometry, shines: BoolArray, vignetting: float, room: Room
+    gels: Gels, target: Target, like: LightGeometry, shines: BoolArray, vignetting: float, room: Room, fitted: bool
 ) -> LightGeometry:
-    """For each of the preset's lights, which shine in channels (m, 3), one of those around."""
-    every = around(like, room)
-    fields = (every.centre, every.direction, every.size, every.viewing_angle_deg)
-    parts = [LightGeometry(*(field[k : k + _CHUNK] for field in fields)) for k in range(0, len(every.centre), _CHUNK)]
+    """For each of some lights, which shine in channels (m, 3), one of those around; if `fitted`, it may be itself."""
+    other = around(like, room)
+    fields = [np.concatenate([getattr(part, f.name) for part in (like, other)]) for f in dataclasses.fields(like)]
+    centre = fields[0]
+    parts = [LightGeometry(*(field[k : k + _CHUNK] for field in fields)) for k in range(0, len(centre), _CHUNK)]
     lit = np.concatenate([contributions(gels, part, alone=True) for part in parts])
     lit = lit * (target.gain * (1 - vignetting * target.corner))[None, :, None] * target.slope
     wanted = target.signal * target.slope
-    norm = np.linalg.norm(lit, axis=1)
+    norm = np.maximum(np.linalg.norm(lit, axis=1), 1e-12)
     strong = norm > 0.01 * norm.max(axis=0)  # beyond, a light that hardly reaches the gel needs any power
 
     def missed(picks: dict[int, int]) -> FloatArray:
@@ -66,16 +69,23 @@ def chosen(
                 left[:, channel] -= columns @ nnls(columns, wanted[:, channel], maxiter=1000)[0]
         return left
 
-    picks: dict[int, int] = {}
-    for light in [*range(len(shines)), *(_ROUNDS - 1) * [*range(len(shines))]]:
+    def exchanged(light: int, picks: dict[int, int]) -> tuple[float, int]:
+        """The least misfit that another pick for the light, or its own, leaves beside the others, and that pick."""
         others = {other: pick for other, pick in picks.items() if other != light}
-        away = np.ones(len(every.centre), dtype=bool)
+        away = np.arange(len(centre)) >= len(shines)
         for pick in others.values():
-            away &= np.linalg.norm(every.centre - every.centre[pick], axis=1) > _APART_MM
+            away &= np.linalg.norm(centre - centre[pick], axis=1) > _APART_MM
         left = missed(others)
-        gain = np.einsum("mpc,pc->mc", lit, left) / np.maximum(norm, 1e-12)
+        gain = np.einsum("mpc,pc->mc", lit, left) / norm
         gain = (np.maximum(gain, 0) ** 2 * strong)[:, shines[light]].sum(axis=1) * away
-        tried = np.argsort(-gain)[:_TRIED]
-        picks[light] = min(tried, key=lambda pick: float(np.sum(missed({**others, light: int(pick)}) ** 2)))
-    order = [picks[light] for light in range(len(shines))]
+        tried = [*np.argsort(-gain)[:_TRIED].tolist(), *([picks[light]] if light in picks else [])]
+        return min((float(np.sum(missed({**others, light: pick}) ** 2)), pick) for pick in tried)
+
+    lights = range(len(shines))
+    picks = {light: light for light in lights if fitted}
+    # One after another; of fitted ones whichever helps most, as one at a wrong place misleads the others.
+    for turn in _ROUNDS * ([lights] if fitted else [[light] for light in lights]):
+        _, pick, light = min((*exchanged(each, picks), each) for each in turn)
+        picks[light] = pick
+    order = [picks[light] for light in lights]
     return LightGeometry(*(field[order] for field in fields))

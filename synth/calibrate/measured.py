@@ -21,7 +21,7 @@ from synth.arrays import FloatArray, Image
 from synth.calibrate.ball_fit import BallFit, Press, placed
 from synth.calibrate.frames import Frames
 from synth.calibrate.irradiance import LightGeometry, LitGel
-from synth.calibrate.sensor_fit import SensorFit, smoothed
+from synth.calibrate.sensor_fit import SensorFit, room_of, smoothed
 from synth.dataset.images import encode_png
 from synth.optics import Optics
 from synth.render.camera_image import off_centre
@@ -33,8 +33,14 @@ FILE, FLAT = "measured_light.yaml", "measured_light.png"
 _DEGREE, _PRIOR, _STEPS, _MOVE = 2, 0.01, 2, 0.05
 """Degree in the place; weight of the coefficients' prior, as of encoded values of pixels; steps of places and depths,
 and by how much these are moved to see what it changes."""
-_ROUNDS, _HEIGHTS, _SIZES = 2, (0.15, 0.25, 0.35, 0.45, 0.6, 0.8), (1.0, 0.3)
-"""How often, and at which heights over the body's and shares of their sizes, lights that throw shadows are sought."""
+_HEIGHTS, _SIZES = (0.15, 0.25, 0.35, 0.45, 0.6, 0.8), (1.0, 0.3)
+"""Heights over the body's, and shares of their sizes, at which lights that throw shadows are sought."""
+_SHIFTS = ((0.0, -0.6, -0.45, -0.3, -0.15, 0.15, 0.3), *3 * ((0.0, -0.1, 0.1),))
+"""What is added to the logarithm of all depths, in rounds: shadows widen the circles that tell depths."""
+_MOVES = (0.0, -6.0, 6.0), (1.0, 0.8, 1.25), (1.0, 0.8, 1.25)
+"""How far lights are turned (degrees), and shares of distance and height, from the second round on."""
+_OUTLIER, _REWEIGHTED = 0.03, 3
+"""Misfit of an encoded value beyond which it counts little, as where a shadow ends elsewhere; rounds that tell it."""
 _FORMS, _COARSE = 10, 1
 """Numbers of A, b and c; px a texel of the flat field."""
 
@@ -57,14 +63,23 @@ def fit_measured(
         weight = gel.visible(LightGeometry.of(lights)) * np.tile(_linear(press.rest, gamma).T, (len(lights) // 3, 1))
         return weight[..., None] * _basis(gel.points[:, :2] / side.min(), gel.normals)
 
-    own = _leads(fit, variant)
-    tried = own + [_shaped(light, sensor, *each) for each in product(_HEIGHTS, _SIZES) for light in own]
-    for _ in range(_ROUNDS):
-        parts = np.concatenate([rows(press, tried) for press in told], axis=1)
-        missed = [np.sum(_solve([parts[k : k + 3]], told, gamma)[1].reshape(3, -1) ** 2, axis=1)
-                  for k in range(0, len(tried), 3)]  # fmt: skip
-        leads = [tried[3 * best + channel] for channel, best in enumerate(np.argmin(missed, axis=0))]
+    leads, body = _leads(fit, variant), sensor.gel.size_mm[2] + sensor.window.thickness_mm
+    tried = leads + [_moved(lead, sensor, 0, 1, share * body, size) for share, size in product(_HEIGHTS, _SIZES)
+                     for lead in leads]  # fmt: skip
+    for shifts in _SHIFTS:
+        found = []
+        for moved in (
+            [replace(press, pose=press.pose + np.array([0, 0, shift])) for press in told] for shift in shifts
+        ):
+            parts = np.concatenate([rows(press, tried) for press in moved], axis=1)
+            missed = np.array([np.sum(_solve([parts[k : k + 3]], moved, gamma)[1].reshape(3, -1) ** 2, axis=1)
+                               for k in range(0, len(tried), 3)])  # fmt: skip
+            picked = [tried[3 * best + channel] for channel, best in enumerate(np.argmin(missed, axis=0))]
+            found.append((float(missed.min(axis=0).sum()), moved, picked))
+        _, told, leads = min(found, key=lambda each: each[0])
         told, coefficients = _solved(told, partial(rows, lights=leads), gamma)
+        tried = [_moved(lead, sensor, turn, out, up * lead.position_mm[2], 1) for turn, out, up in product(*_MOVES)
+                 for lead in leads]  # fmt: skip
 
     def changed(press: Press) -> FloatArray:
         value = np.maximum(np.einsum("cnk,ck->nc", rows(press, leads), coefficients), 0)
@@ -99,10 +114,10 @@ def _solved(presses: list[Press], rows: Callable[[Press], FloatArray], gamma: fl
                 moved = rows(replace(press, pose=press.pose + _MOVE * np.eye(3)[axis]))
                 change = np.einsum("cnk,ck->cn", moved - parts[number], coefficients) / _MOVE
                 column = []
-                for channel, span in enumerate(spans):
+                for channel, (weight, span) in enumerate(spans):
                     whole = np.zeros(len(span))
                     at = slice(first, first + change.shape[1])
-                    whole[at] = change[channel] * slope[at, channel]
+                    whole[at] = change[channel] * slope[at, channel] * weight[at]
                     column.append(whole - span @ (span.T @ whole))
                 columns.append(np.concatenate(column))
         jacobian = np.column_stack(columns)
@@ -122,8 +137,12 @@ def _solved(presses: list[Press], rows: Callable[[Press], FloatArray], gamma: fl
 
 def _solve(
     parts: list[FloatArray], presses: list[Press], gamma: float
-) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
-    """Coefficients, misfit (3 n,), and spans of what coefficients can make, of rows (3, n, 10 terms) for each press."""
+) -> tuple[FloatArray, FloatArray, list[tuple[FloatArray, FloatArray]]]:
+    """Coefficients, misfit (3 n,), and by channel its weights and the span of what coefficients can make.
+
+    `parts` are the rows (3, n, 10 terms) of each press. The misfit r counts as r² / (1 + (r / 0.03)²) (Geman and
+    McClure), found by weights that are taken from the last solution.
+    """
     grid = np.stack(np.meshgrid(*2 * [np.linspace(-0.7, 0.7, 8)]), axis=-1).reshape(-1, 2)
     still = _basis(grid, np.tile([0.0, 0.0, 1.0], (len(grid), 1)))
     slope = _slope(presses, gamma)
@@ -133,10 +152,15 @@ def _solve(
     for channel in range(3):
         matrix = np.vstack([basis[channel], still, _PRIOR * np.eye(still.shape[1])])
         value = np.concatenate([wanted[:, channel], np.ones(len(still)), np.zeros(still.shape[1])])
-        span, triangle = np.linalg.qr(matrix)
-        found.append(np.linalg.solve(triangle, span.T @ value))
-        missed.append(matrix @ found[-1] - value)
-        spans.append(span)
+        weight, seen = np.ones(len(matrix)), np.arange(len(matrix)) < len(wanted)
+        for _ in range(_REWEIGHTED):
+            span, triangle = np.linalg.qr(matrix * weight[:, None])
+            solution = np.linalg.solve(triangle, span.T @ (value * weight))
+            left = matrix @ solution - value
+            weight = np.where(seen, 1 / np.hypot(1, left / _OUTLIER), 1.0)
+        found.append(solution)
+        missed.append(left * weight)
+        spans.append((weight, span))
     return np.array(found), np.concatenate(missed), spans
 
 
@@ -146,10 +170,17 @@ def _slope(presses: list[Press], gamma: float) -> FloatArray:
     return np.asarray(after ** (1 / gamma - 1) / gamma * (after < 0.98))
 
 
-def _shaped(light: Light, sensor: Sensor, height: float, size: float) -> Light:
-    """The light at a share of the body's height, and of its size."""
-    place = (*light.position_mm[:2], height * (sensor.gel.size_mm[2] + sensor.window.thickness_mm))
-    return light.model_copy(update={"position_mm": place, "size_mm": tuple(size * np.array(light.size_mm))})
+def _moved(light: Light, sensor: Sensor, turn_deg: float, out: float, height_mm: float, size: float) -> Light:
+    """The light turned around the gel's middle, at shares of its distance and size, at another height.
+
+    It stays where this is in the camera's view, or outside gel and window.
+    """
+    x, y, _ = light.position_mm
+    cosine, sine = out * np.cos(np.radians(turn_deg)), out * np.sin(np.radians(turn_deg))
+    place = (float(cosine * x - sine * y), float(sine * x + cosine * y), height_mm)
+    moved = light.model_copy(update={"position_mm": place, "size_mm": tuple(size * np.array(light.size_mm))})
+    seen = room_of(sensor).intrusion(LightGeometry.of([moved])).any()
+    return light if seen or height_mm >= sensor.gel.size_mm[2] + sensor.window.thickness_mm else moved
 
 
 def _linear(levels: FloatArray, gamma: float) -> FloatArray:

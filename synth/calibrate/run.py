@@ -26,8 +26,8 @@ from synth.calibrate.report import contact_line, contact_numbers, fitted_content
 from synth.calibrate.rest_map import measured_rest_map, with_rest_map
 from synth.calibrate.sensor_fit import SensorFit, find_bare, find_grid, fit_sensor
 from synth.calibrate.verdict import verdict
+from synth.dataset.atomic_files import refuse_foreign, replace_file, storage_errors
 from synth.dataset.images import encode_png
-from synth.dataset.storage import refuse_foreign, replace_file, storage_errors
 from synth.errors import InputError
 from synth.render.variant import LLVM_HINT, choose_variant
 from synth.scene import Dots, NoPattern, Render, Sensor

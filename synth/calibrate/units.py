@@ -13,7 +13,7 @@ import numpy as np
 import tomli_w
 from scipy.optimize import linear_sum_assignment
 
-from synth.dataset.storage import refuse_foreign, replace_file, storage_errors
+from synth.dataset.atomic_files import refuse_foreign, replace_file, storage_errors
 from synth.errors import InputError
 from synth.scene.template import checked_template, load_scene, with_files
 

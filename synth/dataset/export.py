@@ -33,13 +33,13 @@ from numpy.typing import NDArray
 
 from synth.arrays import BoolArray
 from synth.dataset import hdf5, lerobot, rrd
+from synth.dataset.atomic_files import PARTIAL
 from synth.dataset.images import Raster, encode_png
 from synth.dataset.jsontext import to_document
 from synth.dataset.npz import encode_npz
 from synth.dataset.reader import Dataset, read_dataset
 from synth.dataset.sample import further_cameras, sample_name
 from synth.dataset.sample_reader import SampleData
-from synth.dataset.storage import PARTIAL
 from synth.errors import InputError
 from synth.flow.field import FlowArray
 

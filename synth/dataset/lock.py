@@ -27,10 +27,10 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from synth.dataset.atomic_files import storage_errors
 from synth.dataset.jsontext import parse_document
 from synth.dataset.objects import Objects
 from synth.dataset.shard import Shard
-from synth.dataset.storage import storage_errors
 from synth.errors import InputError
 
 LOCK_FILE = ".lock"

@@ -14,8 +14,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
 
+from synth.dataset.atomic_files import replacing, storage_errors
 from synth.dataset.jsontext import to_line
-from synth.dataset.storage import replacing, storage_errors
 from synth.errors import InputError
 from synth.untrusted import open_file
 

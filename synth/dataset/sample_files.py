@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from synth.dataset.atomic_files import install_folder, partial_name, storage_errors
 from synth.dataset.exr import CONVENTIONS, write_flow
 from synth.dataset.images import encode_png
 from synth.dataset.job import Job
@@ -13,7 +14,6 @@ from synth.dataset.jsontext import jsonable, to_document
 from synth.dataset.manifest import ManifestEntry
 from synth.dataset.npz import encode_npz
 from synth.dataset.sample import Layout, Sample, largest_motion, sample_name
-from synth.dataset.storage import install_folder, partial_name, storage_errors
 from synth.dataset.store import Output, open_store
 from synth.dataset.tracks import MARKERS, MARKERS_FILE, STATES_FILE, encode_table, states_columns, states_of
 

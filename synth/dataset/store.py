@@ -11,13 +11,13 @@ from functools import cache
 from pathlib import Path
 from urllib.parse import unquote, urlparse
 
+from synth.dataset.atomic_files import replace_file, storage_errors
 from synth.dataset.jsontext import read_document
-from synth.dataset.lines import JournalLines, Lines
 from synth.dataset.lock import DirectoryLock, Lease
+from synth.dataset.manifest_lines import JournalLines, Lines
 from synth.dataset.objects import Objects, refusals
 from synth.dataset.sample import Layout, sample_name
 from synth.dataset.shard import Shard
-from synth.dataset.storage import replace_file, storage_errors
 from synth.errors import InputError
 from synth.untrusted import read_file
 

@@ -14,7 +14,7 @@
 
 A sample is finished when its files are whole and its line is on record, written in this order. Whatever a killed run
 leaves (a torn line, a hidden partial folder, a folder without a line) is put right on the next opening. What differs
-between a directory and a URL is in `synth.dataset.store`, how a line is recorded in `synth.dataset.lines`.
+between a directory and a URL is in `synth.dataset.store`, how a line is recorded in `synth.dataset.manifest_lines`.
 """
 
 import contextlib
@@ -23,13 +23,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from synth.dataset.atomic_files import PARTIAL
 from synth.dataset.job import DATASET_FILE, Job, check_record, continued, refuse_another_job
 from synth.dataset.jsontext import parse_document, to_document
 from synth.dataset.lock import LEASES_FOLDER, LOCK_FILE
 from synth.dataset.manifest import FAILURES_FILE, MANIFEST_FILE, Failure, ManifestEntry
 from synth.dataset.sample import Layout, sample_name
 from synth.dataset.shard import Shard
-from synth.dataset.storage import PARTIAL
 from synth.dataset.store import Output, open_store
 from synth.dataset.summary import SUMMARY_FILE, summary_document
 from synth.errors import InputError

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.dataset.atomic_files import replace_file
 from synth.dataset.images import encode_png
-from synth.dataset.storage import replace_file
 from synth.inspect.clips import pictures_of
 from synth.inspect.inspection import Inspection
 from synth.inspect.panels import CLOSURE_RANGE_PX, Arrows, Panel, Rgb, wheel_legend

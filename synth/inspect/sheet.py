@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from synth.dataset.storage import replace_file
+from synth.dataset.atomic_files import replace_file
 from synth.inspect.clips import pictures_of
 from synth.inspect.inspection import Inspection
 from synth.inspect.panels import Panel, wheel_legend

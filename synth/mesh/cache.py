@@ -14,7 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from synth.dataset.storage import replacing
+from synth.dataset.atomic_files import replacing
 from synth.errors import InputError
 from synth.mesh.dome import domed
 from synth.mesh.face import FLAT_FACE, Face, PadFace, face_of

@@ -38,6 +38,8 @@ from synth.simulate.contact_patch import ContactPatch
 
 LEAST_GEL = 0.5
 """Share of pixels that show gel, below which images are warned of."""
+LOOKED_AT = 64
+"""Trajectories, from the first one on, whose images are looked at for a warning, which is given once."""
 
 
 def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
@@ -52,7 +54,7 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
     for shown in simulated.samples:
         started, tracing = time.perf_counter(), list[float]()
         sample = _sample(context, rendered, shown, diagnostics, views, tracing)
-        if shown is simulated.samples[0] and simulated.scene.outputs.images:
+        if simulated.number < LOOKED_AT and shown is simulated.samples[0] and simulated.scene.outputs.images:
             warning = _warning(context, sample, views[""], rendered.frames[shown.frames[0]])
         entry = write_sample_files(context.out, sample, context.job)
         seconds = {**shared, "flow": sum(tracing), "write": time.perf_counter() - started - sum(tracing)}

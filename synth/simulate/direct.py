@@ -9,7 +9,7 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.press.load_path import LoadPath
-from synth.simulate.contact import Indenters
+from synth.simulate.contact_friction import Indenters
 from synth.simulate.linear import norm
 from synth.simulate.policy import requests as ask
 from synth.simulate.policy.load_steps import LoadSteps

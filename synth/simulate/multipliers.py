@@ -1,11 +1,11 @@
 """Contact's history from one load step to the next, as Warp kernels: multipliers and friction's anchors.
 
-The law is `synth.simulate.contact`'s.
+The law is `synth.simulate.contact_friction`'s.
 """
 
 import warp as wp
 
-from synth.simulate.contact import FAR, ON_CONE, ContactState, Faces, Indenters, anchor_of, position
+from synth.simulate.contact_friction import FAR, ON_CONE, ContactState, Faces, Indenters, anchor_of, position
 
 
 @wp.kernel

@@ -16,7 +16,14 @@ import warp as wp
 
 from synth.arrays import FloatArray
 from synth.simulate.bulk import bulk_residual
-from synth.simulate.contact import FAR, ContactState, Indenters, contact_residual, contact_stiffness, contact_tangent
+from synth.simulate.contact_friction import (
+    FAR,
+    ContactState,
+    Indenters,
+    contact_residual,
+    contact_stiffness,
+    contact_tangent,
+)
 from synth.simulate.inversion_barrier import barrier_residual, barrier_tangent
 from synth.simulate.linear import LinearSolver
 from synth.simulate.material import Material

@@ -12,7 +12,7 @@ from synth.mesh.element import EDGES
 from synth.mesh.pad import barycentric_gradients
 from synth.press.load_path import LoadPath, Pose
 from synth.simulate.bulk import Bulk
-from synth.simulate.contact import Faces, Indenters
+from synth.simulate.contact_friction import Faces, Indenters
 from synth.simulate.inversion_barrier import SAMPLE_DEGREE, BarrierTables
 from synth.simulate.material import Material
 from synth.simulate.space import Space

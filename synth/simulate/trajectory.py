@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from synth.arrays import FloatArray
-from synth.dataset.storage import replace_file, storage_errors
+from synth.dataset.atomic_files import replace_file, storage_errors
 from synth.press.load_path import LoadPath, Pose
 from synth.scene import Scene
 from synth.simulate.contact_patch import ContactPatch

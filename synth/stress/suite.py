@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from synth import __version__
-from synth.dataset.storage import refuse_foreign, replace_file, storage_errors
+from synth.dataset.atomic_files import refuse_foreign, replace_file, storage_errors
 from synth.stress.cases import EXTREME, Run, all_runs, compared, load_expectations, selected
 from synth.stress.check import Result, Verdict, evaluate
 

@@ -28,7 +28,7 @@ from scipy.optimize import brentq
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import PadMesh
 from synth.mesh.element import Element
-from synth.simulate.contact import Indenters
+from synth.simulate.contact_friction import Indenters
 from synth.simulate.material import uniform
 from synth.simulate.system import System
 

@@ -25,7 +25,7 @@ from synth.scene import Gel, Numerics, Scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
-from synth.simulate.contact import Indenters
+from synth.simulate.contact_friction import Indenters
 from synth.simulate.direct import DirectPress, DirectSolver, led
 from synth.simulate.material import Material, uniform
 from synth.simulate.options import SolverOptions

@@ -166,9 +166,24 @@ def test_a_layout_is_chosen_from_all_around_and_not_near_the_presets() -> None:
     signal = 300 * np.einsum("mpc,mc->pc", gel.contributions(LightGeometry.of(truth.lights)), np.eye(3))
     target = Target(signal, np.ones_like(signal), 1.0, np.zeros(len(signal)))
     like = LightGeometry.of(start.lights)
-    found = chosen([gel], target, like, np.eye(3, dtype=bool), 0.0, room_of(start))
+    found = chosen([gel], target, like, np.eye(3, dtype=bool), 0.0, room_of(start), fitted=False)
     azimuth = np.degrees(np.arctan2(found.centre[:, 1], found.centre[:, 0]))
     assert azimuth == pytest.approx([-90, 15, 135], abs=15.1)  # candidates are 15 degrees apart
+
+
+@needs_llvm
+def test_of_fitted_lights_the_misplaced_one_is_replaced_and_the_others_stay() -> None:
+    truth, start = _sensor(-90.0, 15.0, 135.0), _sensor(-90.0, -150.0, 135.0)
+    columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(4, 160, 12), np.arange(4, 120, 12)))
+    gel = LitGel(truth, np.column_stack([columns, rows]) + 0.5, FAST)
+    powers = 300 * np.array([[1, 0, 0], [1, 0, 0], [0, 0, 1]])
+    signal = np.einsum("mpc,mc->pc", gel.contributions(LightGeometry.of(truth.lights)), powers)
+    target = Target(signal, np.ones_like(signal), 1.0, np.zeros(len(signal)))
+    like = LightGeometry.of(start.lights)
+    found = chosen([gel], target, like, powers > 0, 0.0, room_of(start), fitted=True)
+    np.testing.assert_array_equal(found.centre[[0, 2]], like.centre[[0, 2]])
+    azimuth = np.degrees(np.arctan2(found.centre[1, 1], found.centre[1, 0]))
+    assert azimuth == pytest.approx(15, abs=15.1)  # candidates are 15 degrees apart
 
 
 @pytest.mark.slow

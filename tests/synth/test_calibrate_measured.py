@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from render_scenes import FAST, needs_llvm, small_sensor
 
 from synth.arrays import FloatArray
@@ -31,8 +32,12 @@ def _brightness(place: FloatArray, normal: FloatArray) -> FloatArray:
     return np.asarray(0.3 * (1 + 0.05 * place @ out) * np.maximum(normal[:, 2:] + slope, 0))
 
 
+# Each slope is shown at a few places only, between which the light changes by some 5 %; a depth that is found to some
+# per cent from a start of 50 % changes slopes by as much.
 @needs_llvm
-def test_light_on_tilted_faces_is_recovered_from_presses(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("deeper", "tolerance"), [(1.0, 0.05), (1.5, 0.1)], ids=["known", "too deep"])
+def test_light_on_tilted_faces_is_recovered_from_presses(tmp_path: Path, deeper: float, tolerance: float) -> None:
+    """Also from presses that are taken for deeper ones."""
     lights = tuple(
         Light(position_mm=(8 * np.cos(a), 8 * np.sin(a), 2.9), size_mm=(0.5, 0.5), color=tuple(np.eye(3)[c]), power=300)
         for c, a in enumerate(DIRECTIONS)
@@ -56,6 +61,7 @@ def test_light_on_tilted_faces_is_recovered_from_presses(tmp_path: Path) -> None
         before, after = 255 * rest.reshape(-1, 3)[::29], 255 * shown(gel, press.pixels) ** (1 / 2.2)
         presses.append(Press(press.name, press.contact, press.pixels, before, after - before, press.pose))
     pose = presses[-1].pose
+    presses = [replace(press, pose=press.pose + np.array([0, 0, np.log(deeper)])) for press in presses]
     presses[-1] = replace(
         presses[-1], pose=pose + np.array([0.2, -0.2, 0.2])
     )  # as lights that are not measured would have it
@@ -63,15 +69,15 @@ def test_light_on_tilted_faces_is_recovered_from_presses(tmp_path: Path) -> None
     whole = SensorFit(sensor, fit, None, None, np.ones((120, 160), bool), BallFit(fit, tuple(presses), (), series))
     lit, model = fit_measured(whole, Frames(rest, rest, 1 / 255), frozenset({"b4"}), FAST)
     assert lit.pressed is not None
-    np.testing.assert_allclose(
-        lit.pressed.presses[-1].pose, pose, atol=0.05
-    )  # of the search, 0.01, and the light's 5 %
-    # Each slope is shown at a few places only, between which the light changes by some 5 %.
+    # Of the search, 0.01, and the light's error.
+    np.testing.assert_allclose(lit.pressed.presses[-1].pose, pose, atol=1.5 * tolerance)
     for polar, azimuth in np.radians(TILTS):
         normal = np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
         place = np.array([(-2.5, -1.5), (2.5, 1.5), (0.0, 0.0)])
         found = _published(model, place, normal)
-        assert np.abs(found - _brightness(place, np.tile(normal, (3, 1)))).max() < 0.3 * (0.01 if polar == 0 else 0.05)
+        assert np.abs(found - _brightness(place, np.tile(normal, (3, 1)))).max() < 0.3 * (
+            tolerance / 5 if polar == 0 else tolerance
+        )
     for name, content in zip((FILE, FLAT), written(model), strict=True):
         (tmp_path / name).write_bytes(content)
     read = read_measured_light(lit.sensor, tmp_path)

@@ -29,7 +29,7 @@ from synth.simulate.batched.product import (
     store_contact,
 )
 from synth.simulate.batched.run import OPTIONS, Asked
-from synth.simulate.contact import contact_stiffness
+from synth.simulate.contact_friction import contact_stiffness
 from synth.simulate.material import uniform
 from synth.simulate.options import SolverOptions
 from synth.simulate.space import function_space

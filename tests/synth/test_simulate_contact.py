@@ -5,7 +5,7 @@ import pytest
 from pads import MIXED, areas, dense
 from touching import INDENTERS, MESH, PENALTY, RADIUS, SLIP, STICK, sphere_law, touch
 
-from synth.simulate.contact import FAR
+from synth.simulate.contact_friction import FAR
 from synth.simulate.system import Unknowns
 
 frictions = pytest.mark.parametrize("friction", [0.0, SLIP, 0.7, STICK])

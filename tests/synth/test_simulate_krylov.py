@@ -10,11 +10,10 @@ from pads import SIZE, brick, scene
 
 from synth.press.press import Press
 from synth.simulate.batched import krylov as kernels
-from synth.simulate.batched.gemm import dense
+from synth.simulate.batched.gpu import dense, inverse
 from synth.simulate.batched.krylov import Krylov, arnoldi, block_size, flat, padded, round_rows
 from synth.simulate.batched.lane import Lane
-from synth.simulate.batched.lanes import Number, Order, Seen, select
-from synth.simulate.batched.pad import inverse
+from synth.simulate.batched.lane_orders import Number, Order, Seen, select
 from synth.simulate.linear import GMRES_LIMIT
 from synth.simulate.options import STANDARD
 from synth.simulate.policy.load_steps import LoadSteps

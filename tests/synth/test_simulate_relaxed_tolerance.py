@@ -25,7 +25,7 @@ from synth.mesh import PadMesh
 from synth.press.press import Press
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate
-from synth.simulate.batched.lanes import Order
+from synth.simulate.batched.lane_orders import Order
 from synth.simulate.batched.pad import prepare
 from synth.simulate.batched.run import Run
 from synth.simulate.direct import DirectPress

@@ -13,7 +13,7 @@ STAGES = (
     "synth",  # the package itself: its version, and where its public names are, which it loads when they are asked for
     "synth.errors", "synth.arrays", "synth.untrusted",
     "synth.warp_start",
-    "synth.dataset.storage",  # how a file gets to the disk as a whole; knows nothing of datasets
+    "synth.dataset.atomic_files",  # how a file gets to the disk as a whole; knows nothing of datasets
     "synth.scene", "synth.surface", "synth.optics", "synth.mesh", "synth.press", "synth.simulate", "synth.flow",
     "synth.render",
     "synth.sampling",  # draws again what could not be rendered
@@ -111,7 +111,7 @@ def test_networks_need_no_baseline_baselines_no_weights_and_the_writer_no_kind_o
     assert [pair for pair in gelflow if pair[0].startswith("gelflow.baselines") and pair[1].startswith(weights)] == []
     kinds = {f"synth.dataset.store.{name}Store" for name in ("Directory", "Remote")} | {"synth.dataset.objects"}
     askers = {name for name, imported in synth if imported in kinds}
-    assert askers == {"synth.dataset.store", "synth.dataset.lines", "synth.dataset.lock"}
+    assert askers == {"synth.dataset.store", "synth.dataset.manifest_lines", "synth.dataset.lock"}
 
 
 @pytest.mark.parametrize(("modules", "forbidden"), [

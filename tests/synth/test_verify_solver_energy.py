@@ -18,7 +18,7 @@ from synth.arrays import FloatArray
 from synth.mesh import PadMesh
 from synth.press.press import Press
 from synth.scene import Scene
-from synth.simulate.contact import Indenters
+from synth.simulate.contact_friction import Indenters
 from synth.simulate.direct import DirectPress
 from synth.simulate.material import pad_material
 from synth.simulate.options import STANDARD

@@ -9,7 +9,7 @@ import numpy as np
 from pads import ELEMENT, crooked, indenters, scene, system
 
 from synth.arrays import BoolArray, FloatArray
-from synth.simulate.contact import Indenters
+from synth.simulate.contact_friction import Indenters
 from synth.simulate.system import Residual, System, Unknowns
 
 MESH = crooked()
@@ -113,7 +113,7 @@ def touch(friction: float, shape: str = "sphere", multipliers: bool = True, fres
 
 
 def sphere_law(made: Touch) -> tuple[FloatArray, FloatArray]:
-    """Normal and tangential traction (f, q, 3) of a ball by the formulas of `synth.simulate.contact`."""
+    """Normal and tangential traction (f, q, 3) of a ball by the formulas of `synth.simulate.contact_friction`."""
     contact, rotation = made.body.contact, made.rotation
     away = made.points - made.centre
     distance = np.linalg.norm(away, axis=-1, keepdims=True)

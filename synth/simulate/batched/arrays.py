@@ -12,12 +12,12 @@ import warp as wp
 
 from synth.simulate.batched.fields import ContactMemory, Fields
 from synth.simulate.batched.krylov import Krylov, flat, shapes
-from synth.simulate.batched.lanes import Number, Seen
+from synth.simulate.batched.lane_orders import Number, Seen
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.product import STORED, STORED_YEOH, SingleTables
 from synth.simulate.batched.reductions import SCALARS
 from synth.simulate.bulk import Bulk
-from synth.simulate.contact import ContactState, Indenters
+from synth.simulate.contact_friction import ContactState, Indenters
 from synth.simulate.space import Space
 from synth.simulate.tables import struct_of, warp_array, zeros_of
 

@@ -4,8 +4,8 @@ from typing import Any
 
 import warp as wp
 
-from synth.simulate.batched.lanes import RATIO, SHARE, Order
-from synth.simulate.contact import FAR, ContactState
+from synth.simulate.batched.lane_orders import RATIO, SHARE, Order
+from synth.simulate.contact_friction import FAR, ContactState
 
 TAKE, KEEP_STEP, KEEP_PASS = (wp.constant(int(o)) for o in (Order.TAKE, Order.KEEP_STEP, Order.KEEP_PASS))
 RESTORE_STEP, ACCEPT, BEGIN, PREDICT, TRY = (
@@ -218,7 +218,7 @@ def clear_contact(mask: wp.array(dtype=wp.int32), contact: ContactState):
 
 @wp.struct
 class ContactMemory:
-    """What corrections of a recorded state change of contact, (B, f, nq): see `synth.simulate.contact`.
+    """What corrections of a recorded state change of contact, (B, f, nq): see `synth.simulate.contact_friction`.
 
     gap, tangential: of the last evaluation; the others are arrays of `ContactState`.
     """

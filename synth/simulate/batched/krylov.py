@@ -7,7 +7,7 @@ another.
 
 Memory decides the time, so one block of threads has a lane's vector in its registers and reads every basis vector once
 an iteration: vectors of a lane lie together, in fours, (B, ..., rows / 4), and each lane goes through as many as it
-has. The tangent's product wants lanes next to each other, (rows, B); `synth.simulate.batched.gemm` turns its argument
+has. The tangent's product wants lanes next to each other, (rows, B); `synth.simulate.batched.gpu` turns its argument
 and its result. Sums are taken by a block in a fixed order, so that nothing here depends on other lanes (what
 goes in does on a GPU: see `synth.simulate.batched.solver`).
 
@@ -20,7 +20,7 @@ from functools import cache
 
 import warp as wp
 
-from synth.simulate.batched.lanes import GOAL, NORM, STICKING, Seen
+from synth.simulate.batched.lane_orders import GOAL, NORM, STICKING, Seen
 from synth.simulate.linear import GMRES_LIMIT
 
 SEEN_DONE, SEEN_FINITE = wp.constant(int(Seen.DONE)), wp.constant(int(Seen.FINITE))

@@ -4,7 +4,7 @@ from collections.abc import Generator
 from typing import Any
 
 from synth.arrays import FloatArray
-from synth.simulate.batched.lanes import PATH_DERIVATIVE_STEP, Number, Order, Seen
+from synth.simulate.batched.lane_orders import PATH_DERIVATIVE_STEP, Number, Order, Seen
 from synth.simulate.linear import GMRES_TOLERANCE
 from synth.simulate.policy import requests as ask
 from synth.simulate.policy.load_steps import LoadSteps

@@ -7,7 +7,7 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.press.distance import SHAPE_LENGTH
 from synth.press.press import Press
-from synth.simulate.batched.lanes import Presses
+from synth.simulate.batched.lane_orders import Presses
 from synth.simulate.batched.reductions import SCALARS
 from synth.simulate.policy.requests import Record
 from synth.simulate.space import Space
@@ -18,7 +18,7 @@ from synth.simulate.trajectory import State, Trajectory, at_rest
 class PressTable:
     """The presses in the lanes, by columns; row s is lane s's.
 
-    `kind` (B,) and `shape` (B, k) are of the bodies, see `synth.simulate.contact.Indenters`.
+    `kind` (B,) and `shape` (B, k) are of the bodies, see `synth.simulate.contact_friction.Indenters`.
     """
 
     def __init__(self, batch: int, device: str) -> None:

@@ -3,8 +3,8 @@
 import warp as wp
 
 from synth.simulate.batched.fields import Fields, node_step
-from synth.simulate.batched.lanes import NORM, RECORD, SHARE, Order, Seen
-from synth.simulate.contact import Faces, Indenters, position
+from synth.simulate.batched.lane_orders import NORM, RECORD, SHARE, Order, Seen
+from synth.simulate.contact_friction import Faces, Indenters, position
 
 BLOCK = 256
 """Threads that sum a lane's residual."""

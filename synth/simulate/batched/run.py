@@ -11,7 +11,7 @@ import numpy as np
 
 from synth.press.press import Press
 from synth.simulate.batched.lane import Lane
-from synth.simulate.batched.lanes import Number
+from synth.simulate.batched.lane_orders import Number
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.presses import trajectory
 from synth.simulate.batched.solver import INNER_ITERATIONS, BatchedSolver

@@ -1,6 +1,6 @@
 """A batch of lanes on one device, and the cycle of kernels that takes all of them on.
 
-A cycle does what the lanes are told (`synth.simulate.batched.lanes.Order`), begins linear solves, does INNER_ITERATIONS
+A cycle does what the lanes are told (`synth.simulate.batched.lane_orders`), begins linear solves, does INNER_ITERATIONS
 Krylov iterations of all that are running, and evaluates iterates and trials, those of directions that it has found
 among them. A kernel is launched once for all lanes that want it, and not at all where none does. Then the host reads
 what all lanes have seen, and their policies say what is next.
@@ -19,10 +19,10 @@ import warp as wp
 
 from synth.arrays import FloatArray
 from synth.press.press import Press
-from synth.simulate.batched import fields, lanes, reductions
+from synth.simulate.batched import fields, lane_orders, reductions
 from synth.simulate.batched import krylov as gmres
 from synth.simulate.batched.arrays import BatchArrays, number_rows
-from synth.simulate.batched.lanes import PATH_DERIVATIVE_STEP, Order
+from synth.simulate.batched.lane_orders import PATH_DERIVATIVE_STEP, Order
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.presses import PressTable, padded
 from synth.simulate.batched.product import (
@@ -35,7 +35,7 @@ from synth.simulate.batched.product import (
     store_contact,
 )
 from synth.simulate.bulk import bulk_residual
-from synth.simulate.contact import contact_residual, contact_stiffness
+from synth.simulate.contact_friction import contact_residual, contact_stiffness
 from synth.simulate.inversion_barrier import barrier_residual
 from synth.simulate.multipliers import augment, update_contact_history
 from synth.simulate.stiffness import viscous_force
@@ -94,7 +94,7 @@ class BatchedSolver:
     def begin_cycle(self, orders: np.ndarray, numbers: FloatArray) -> None:
         """Do what all lanes are told; on CUDA queue it.
 
-        orders: (B,) sets of `lanes.Order`; numbers: (B, k) by the columns of `lanes.Number`.
+        orders: (B,) sets of `lane_orders.Order`; numbers: (B, k) by the columns of `lane_orders.Number`.
         """
         a = self._arrays
         a.orders.assign(orders)
@@ -102,12 +102,12 @@ class BatchedSolver:
         self._wanted = int(np.bitwise_or.reduce(orders))
         self._end_solves()
         self._begin_steps()
-        self._launch(lanes.viscosities, self.batch, a.numbers, a.viscosity)
-        self._launch(lanes.place_indenters, self.batch, a.orders, a.numbers, self._presses, a.indenters)
+        self._launch(lane_orders.viscosities, self.batch, a.numbers, a.viscosity)
+        self._launch(lane_orders.place_indenters, self.batch, a.orders, a.numbers, self._presses, a.indenters)
         self._solve_and_evaluate()
 
     def seen(self) -> FloatArray:
-        """Wait for the end of the cycle; (B, k) what the lanes have seen, by the columns of `lanes.Seen`."""
+        """Wait for the end of the cycle; (B, k) what the lanes have seen, by the columns of `lane_orders.Seen`."""
         return np.asarray(self._arrays.seen.numpy())
 
     def _solve_and_evaluate(self) -> None:
@@ -127,7 +127,7 @@ class BatchedSolver:
 
     def _launch_all(self) -> None:
         a = self._arrays
-        self._launch(lanes.select, self.batch, a.orders, int(Order.SOLVE), a.mask)
+        self._launch(lane_orders.select, self.batch, a.orders, int(Order.SOLVE), a.mask)
         self._linearise()
         for _ in range(self.inner):
             self._iterate()
@@ -141,7 +141,7 @@ class BatchedSolver:
         wanted = sum(orders)
         if not self._wanted & wanted:
             return False
-        self._launch(lanes.select, self.batch, self._arrays.orders, wanted, self._arrays.mask)
+        self._launch(lane_orders.select, self.batch, self._arrays.orders, wanted, self._arrays.mask)
         return True
 
     def _end_solves(self) -> None:
@@ -174,7 +174,7 @@ class BatchedSolver:
         a = self._arrays
         if self._told(Order.RESTORE_STEP):
             self._launch(fields.copy_memory, a.points, a.mask, a.saved, a.memory)
-        self._launch(lanes.set_stiffness, self.batch, a.numbers, self._presses, a.indenters)
+        self._launch(lane_orders.set_stiffness, self.batch, a.numbers, self._presses, a.indenters)
         if self._told(Order.RESTORE_STEP, Order.ACCEPT, Order.BEGIN):
             self._launch(fields.to_start, self._value_dim, a.orders, a.numbers, a.fields)
         if self._told(Order.ACCEPT):
@@ -183,7 +183,7 @@ class BatchedSolver:
             where = (self._rows.node_row, self._rows.pressure_row, a.fields)
             self._launch(fields.apply_predictor, self._value_dim, a.orders, PATH_DERIVATIVE_STEP, a.step, *where)
         if self._told(Order.AUGMENT):
-            self._launch(lanes.augmented_shares, self.batch, a.orders, a.numbers, a.shares)
+            self._launch(lane_orders.augmented_shares, self.batch, a.orders, a.numbers, a.shares)
             self._launch(augment, a.points, a.shares, a.indenters, a.gap, a.tangential, PENALTY, a.contact)
 
     def _update_contact_history(self, u: wp.array, new_only: int) -> None:
@@ -195,7 +195,7 @@ class BatchedSolver:
         """Evaluate the residuals of iterates and trials."""
         a, self._part = self._arrays, "residual"
         f, mask, elements = a.fields, a.mask, self._element_dim
-        self._launch(lanes.select_evaluated, self.batch, a.orders, a.found, mask)
+        self._launch(lane_orders.select_evaluated, self.batch, a.orders, a.found, mask)
         where, residual = (self._rows.node_row, self._rows.pressure_row), (a.force, a.volume, a.jacobian)
         trial = (a.orders, a.numbers, a.found, mask, a.step, *where, f, a.force, a.viscous, a.volume)
         self._launch(fields.compute_trial, self._value_dim, *trial)

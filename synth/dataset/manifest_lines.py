@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from synth.dataset.atomic_files import remove_partials, storage_errors
 from synth.dataset.jsontext import parse_document, to_line
 from synth.dataset.manifest import (
     FAILURES_FILE,
@@ -27,7 +28,6 @@ from synth.dataset.manifest import (
 )
 from synth.dataset.objects import Objects
 from synth.dataset.shard import Shard
-from synth.dataset.storage import remove_partials, storage_errors
 from synth.errors import InputError
 
 SHARDS_FOLDER = "shards"

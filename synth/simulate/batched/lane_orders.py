@@ -9,7 +9,7 @@ from enum import IntEnum, IntFlag
 
 import warp as wp
 
-from synth.simulate.contact import Indenters
+from synth.simulate.contact_friction import Indenters
 from synth.simulate.policy import requests
 
 
@@ -61,7 +61,7 @@ class Presses:
             the lane's first press.
         origin, axes: of `LoadPath.frame`; zeros and the identity for flat pads and domes.
         position, rotation: of the body, as `LoadPath.pose` uses them; reach: the body's less the face's z, mm.
-        friction: as `synth.simulate.contact.Indenters`; sharpness: times the contact stiffness, E per mm.
+        friction: as `synth.simulate.contact_friction.Indenters`; sharpness: times the contact stiffness, E per mm.
     """
 
     corners: wp.array2d(dtype=wp.vec4d)
