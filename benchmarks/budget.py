@@ -12,12 +12,14 @@ a field and the reference's, the error is the largest over the states of
 
     error_px  sqrt(mean |P(X + u) - P(X + r)|²)
 
-over the points that are in the picture in both, by the same mirror if there are mirrors. Time is processor time of the
-solver. Of each scene the table tells how many of the draws that can be judged are within their target; of how many the
-chosen mesh costs at most twice the cheapest mesh within the target, by time and by unknowns to the power 1.25; error
-over target, median and 95th percentile; and measured over predicted error, geometric mean and standard deviation of the
-logarithm. *own* is the reference's own error over the target, the median, by Richardson's extrapolation from the finest
-other mesh. Rows are found again by scene, seed and draw: after a change of the solver begin with an empty directory.
+over the points that are in the picture in both, by the same mirror if there are mirrors. force_percent and
+displacement_percent are the largest errors of the contact force and of the points' displacement (root mean square),
+each over the largest of the reference's states. Time is processor time of the solver. Of each scene the table tells how
+many of the draws that can be judged are within their target; of how many the chosen mesh costs at most twice the
+cheapest mesh within the target, by time and by unknowns to the power 1.25; error over target, median and 95th
+percentile; and measured over predicted error, geometric mean and standard deviation of the logarithm. *own* is the
+reference's own error over the target, the median, by Richardson's extrapolation from the finest other mesh. Rows are
+found again by scene, seed and draw: after a change of the solver begin with an empty directory.
 """
 
 import math
@@ -26,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.press import face_displacement, face_grid, timed
+from benchmarks.press import face_displacement, face_grid, root_mean_square, timed
 from benchmarks.rows import Row, arguments, machine, measure, plot, show
 from synth.arrays import BoolArray, FloatArray
 from synth.cli_options import DEFAULT_SCENE
@@ -35,6 +37,7 @@ from synth.mesh import Counts, Focus, PadMesh, domed, face_height, graded_box
 from synth.optics import Optics
 from synth.optics.camera import Paths
 from synth.planning.prediction import SOLVE_GROWTH
+from synth.press.error_model import error_percent
 from synth.press.footprint import footprint
 from synth.press.press import MeshRule
 from synth.press.resolution import (
@@ -183,13 +186,27 @@ def press_draw(case: Row, assignments: list[str], most: int) -> list[Row]:
             row = {**about, "mesh": "x".join(map(str, fineness)), "chosen": fineness == own, **_outcome(found, shown)}
             row |= {"seconds": round(seconds, 3), "unknowns": 3 * len(found.space.points), "spacing_mm": spacing_mm}
             row["predicted_px"] = predicted_error_px(scene, zone, spacing_mm)
+            percent = error_percent(scene, zone, spacing_mm)
+            row["predicted_percent"] = None if np.isnan(percent) else percent
             if field is not None and found.status == "complete":
                 px, seen = picture_errors(face_displacement(found, points, shown), field, scene)
                 row |= {"error_px": None if np.isnan(px).any() else float(px.max()), "seen": float(seen.min())}
+                row["force_percent"], row["displacement_percent"] = percents(found, truth, points, shown)
             rows.append(row)
     except InputError as error:  # an indenter that cannot be built
         return [{**about, "mesh": "none", "chosen": True, "status": "refused", "reason": str(error)}]
     return rows
+
+
+def percents(found: Trajectory, truth: Trajectory, points: FloatArray, shown: list[int]) -> tuple[float, float]:
+    """Errors of force and displacement, see the module."""
+    forces = [np.array([[each.states[state].force_n] for state in shown]) for each in (found, truth)]
+    fields = [face_displacement(each, points, shown) for each in (found, truth)]
+    force, displacement = (
+        float(100 * root_mean_square(own - reference).max() / root_mean_square(reference).max())
+        for own, reference in (forces, fields)
+    )
+    return force, displacement
 
 
 def _outcome(found: Trajectory, shown: list[int]) -> Row:
@@ -283,6 +300,7 @@ def main(argv: list[str]) -> int:
     if len(names) > 1:
         table.append(summary("all", len(cases), judged))
     columns = ["draw", "mesh", "chosen", "indenter", "depth_mm", "seconds", "predicted_px", "error_px", "target_px"]
+    columns += ["predicted_percent", "force_percent", "displacement_percent"]
     if len(names) == 1:
         show(rows, [*columns, "penetration_mm", "status"], f"Meshes of the draws of {names[0]}")
     missed = [verdict for verdict in judged if not verdict["within"] or verdict["times_cheapest"] > LARGEST_RATIO]

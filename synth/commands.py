@@ -18,7 +18,6 @@ from synth.errors import InputError, printable
 
 if TYPE_CHECKING:
     from synth.pipeline.generate import Summary
-    from synth.planning import Prediction
     from synth.render.variant import Variant
     from synth.scene.template import Template
     from synth.simulate import Trajectory
@@ -301,24 +300,13 @@ def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> i
         f"picture: {camera.width} x {camera.height} px, principal point {camera.cx:.4g}, {camera.cy:.4g}, {scale:.3g} "
         f"px per mm on the gel, {seen if sensor.gel.is_flat and camera.lens == 'pinhole' else 'at most'}\n"
         f"mesh: {predicted.resolution}, about {predicted.nodes} displacement nodes\n"
-        + _error_line(predicted)
+        + "".join(f"{line}\n" for line in predicted.error_lines())
         + f"predicted per {unit}: {stages}; {predicted.bytes_per_pair / 1e6:.2f} MB\n"
         f"predicted for {n} {kind}: {duration(n * seconds)} on one core, {n * predicted.bytes_per_pair / 1e9:.2f} GB\n"
         f"predicted memory: {predicted.memory_bytes / 1e9:.1f} GB for each process that renders\n"
         "times are predicted within a factor of three"
     )
     return 0
-
-
-def _error_line(predicted: Prediction) -> str:
-    """What the plan says of the simulation's discretisation error."""
-    if predicted.error_px is None or predicted.target_error_px is None:
-        return "the simulation's discretisation error is not predicted for meshes of fTetWild\n"
-    median, largest = predicted.error_px
-    line = f"predicted error of the flow from the simulation: {median:.2g} px (median), {largest:.2g} px (largest)"
-    if largest > predicted.target_error_px:
-        return f"{line}; for some trajectories the mesh does not reach the target of {predicted.target_error_px:g} px\n"
-    return f"{line}; target {predicted.target_error_px:g} px\n"
 
 
 def _show_summary(summary: Summary, variant: Variant, kind: str) -> None:

@@ -10,6 +10,7 @@ import sys
 import time
 from contextlib import closing, nullcontext
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -112,7 +113,7 @@ def live(
         Path | None, Parameter(help="File to write the motion of the first frame's dots to, as it comes (CSV).")
     ] = None,
     out: Annotated[
-        Path | None, Parameter(help="Folder to record flow (EXR) and motion.csv to, as predict does.")
+        Path | None, Parameter(help="Folder to record to what predict writes: flow (EXR), motion.csv, a video.")
     ] = None,
     scene: Places = None,
     size: Size = None,
@@ -144,28 +145,29 @@ def live(
     pace, scale, started = Pace(), 0.0, time.perf_counter()
     marked = markers is not None or (page is not None and reference == "first")
     try:
-        with (
-            closing(follow(estimator, source, reference, marked, places)) as flows,
-            nullcontext() if markers is None else markers.open("w", newline="", encoding="utf-8") as table,
-            nullcontext() if out is None else closing(Recording(out)) as recording,
-        ):
-            if table:
-                csv.writer(table).writerow(marker_table(places))
-            for flow in flows:
-                pace.add(flow)
-                motion = flow.motion
-                if recording:
-                    recording.add(flow.found, motion)
-                if table and flow.markers is not None:
-                    csv.writer(table).writerows(marker_rows(motion.frame, motion.time_s, flow.markers, places))
-                    table.flush()
-                line = {**asdict(motion), "latency_s": flow.latency_s, "left_out": flow.left_out}
-                words = f"frame {motion.frame}: {_words(motion)}; {pace}"
-                if page:
-                    scale = show_live(page, flow, words, scale)
-                print(json.dumps(line) if as_json else words, flush=True)
-                if time.perf_counter() - started >= seconds:
-                    break
+        with closing(follow(estimator, source, reference, marked, places)) as flows:
+            first = next(flows)  # a source that does not open replaces no files
+            with (
+                nullcontext() if out is None else closing(Recording(out)) as recording,
+                nullcontext() if markers is None else markers.open("w", newline="", encoding="utf-8") as table,
+            ):
+                if table:
+                    csv.writer(table).writerow(marker_table(places))
+                for flow in chain([first], flows):
+                    pace.add(flow)
+                    motion = flow.motion
+                    if recording:
+                        recording.add(flow.frame, flow.found, motion)
+                    if table and flow.markers is not None:
+                        csv.writer(table).writerows(marker_rows(motion.frame, motion.time_s, flow.markers, places))
+                        table.flush()
+                    line = {**asdict(motion), "latency_s": flow.latency_s, "left_out": flow.left_out}
+                    words = f"frame {motion.frame}: {_words(motion)}; {pace}"
+                    if page:
+                        scale = show_live(page, flow, words, scale)
+                    print(json.dumps(line) if as_json else words, flush=True)
+                    if time.perf_counter() - started >= seconds:
+                        break
     except KeyboardInterrupt:
         pass
     except BrokenPipeError:  # whoever read the lines has enough of them

@@ -105,8 +105,7 @@ def write_flow(
     }
     with replacing(path) as temporary:
         try:
-            with quiet():
-                OpenEXR.File(header, planes).write(str(temporary))
+            OpenEXR.File(header, planes).write(str(temporary))  # it prints nothing, and a thread may be here
         except RuntimeError as error:
             raise OSError(f"cannot write {path}: {error}") from error
 

@@ -18,7 +18,7 @@ def quiet() -> Iterator[None]:
     """Sends the file descriptors 1 and 2 to the null device while the block runs. Exceptions pass through.
 
     `sys.stdout` and `sys.stderr` are replaced, too: OpenEXR warns through Python. Works for the whole process, so hold
-    it only around a library's call.
+    it only around a library's call, and not in a thread beside one that prints: its lines would be dropped, too.
     """
     sys.stdout.flush()
     sys.stderr.flush()

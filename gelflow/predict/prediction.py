@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
 from itertools import pairwise
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.arrays import Bytes3, Estimate, FlowArray, Frame
+from gelflow.arrays import Estimate, FlowArray, Frame
 from gelflow.data.pairs import PairDataset
 from gelflow.data.record import PairRecord
 from gelflow.errors import InputError
@@ -34,6 +34,7 @@ MOTIONS, MOTIONS_BEGIN = "motion.csv", b"mean_px,p95_px"
 """The table of motions, and what tells it from other tables."""
 MARKERS, MARKERS_BEGIN = "markers.csv", b"id,frame,time_s,x"
 """The table of markers, likewise."""
+OVERLAY = "overlay.mp4"
 
 
 @dataclass(frozen=True)
@@ -131,10 +132,9 @@ def predict_video(
 
     Every `every`-th frame of a video file or a folder of images is taken; the flow leads to it from the first one or
     from its predecessor. With `markers`, markers.csv holds those of the first frame in each other, in mm where `places`
-    (`gelflow.track.places`) are given. `progress` is called
-    with the number of frames done and to be done; each counts twice, for flow and overlay. InputError where the video
-    does not open, fewer than two frames decode, a frame cannot be used, or files of these names are somebody else's;
-    OSError where a file cannot be written.
+    (`gelflow.track.places`) are given. `progress` is called with the number of frames done and to be done; each counts
+    twice, for flow and overlay. InputError where the video does not open, fewer than two frames decode, a frame cannot
+    be used, or files of these names are somebody else's; OSError where a file cannot be written.
     """
     if every < 1:
         raise InputError(f"every = {every}: at least 1 is needed")
@@ -145,11 +145,7 @@ def predict_video(
     if expected < 1:
         words = f"takes one of the {info.frames} frames, a flow needs two; allowed are 1 to {info.frames - 1}"
         raise InputError(f"{path}: every = {every} {words}")
-    video = out / "overlay.mp4"
-    refuse_foreign(out / MOTIONS, MOTIONS_BEGIN, video)
-    refuse_foreign(out / MARKERS, MARKERS_BEGIN)
-    for earlier in earlier_flows(out):
-        refuse_foreign(earlier, DIRECTIONS.encode())
+    former = earlier_files(out)
     sources = dict(enumerate(image_files(path))) if path.is_dir() else {}
     files: list[Path] = []
     motions: list[Motion] = []
@@ -170,7 +166,7 @@ def predict_video(
         if moved is not None:
             marked.append((index, time_s, moved))
         if not files:
-            for earlier in earlier_flows(out):
+            for earlier in former:
                 earlier.unlink()
         files.append(flow_file(out, index))
         write_flow(files[-1], found.flow, found.visible, found.sigma)
@@ -183,21 +179,14 @@ def predict_video(
         rows = (row for index, time_s, moved in marked for row in marker_rows(index, time_s, moved, places))
         write_csv(out / MARKERS, marker_table(places), rows)
         tables.append(out / MARKERS)
-    elif (out / MARKERS).exists():
-        (out / MARKERS).unlink()
 
-    def overlays() -> Iterator[Bytes3]:
-        for count, (index, _, frame) in enumerate(_frames(path, every), len(motions)):
-            flow = np.zeros((*frame.shape[:2], 2), np.float32)
-            if index > 0:
-                field = read_flow(flow_file(out, index))
-                flow = certain(field.flow, field.sigma)
-            image = in_unit_range(frame)
-            yield draw_overlay(to_bytes(full_range(image, image)[0]), flow, scale)
+    def drawn() -> Iterator[tuple[int, Frame]]:
+        for index, _, frame in _frames(path, every):
+            yield index, frame
             if progress and index > 0:
-                progress(count, 2 * expected)
+                progress(len(motions) + index // every, 2 * expected)
 
-    _write_overlay(overlays(), video, *_places(times, info.frames_per_second / every))
+    video = write_overlay(out, drawn(), times, info.frames_per_second / every, scale)
     return Prediction([*files, *tables, video], motions, info.lost)
 
 
@@ -217,25 +206,24 @@ def _frames(path: Path, every: int) -> Iterator[tuple[int, float | None, Frame]]
         yield index, time_s, frame
 
 
-def _places(times: list[float], frames_per_second: float) -> tuple[list[int], float]:
-    """Numbers of the frames in a video of a constant rate, and the rate, as fine as keeps the frames apart.
+def write_overlay(
+    out: Path, frames: Iterable[tuple[int, Frame]], times: list[float], frames_per_second: float, scale_px: float
+) -> Path:
+    """Writes a video of numbered frames with the flow to each, which is read from its file; frame 0 has none.
 
-    OpenCV writes no time stamps. MPEG-4 takes no rates above `MAX_RATE`, and no finer fractions.
+    Each frame stays until the time of the next. OSError where the video cannot be written.
     """
-    while True:
-        rate = round(min(max(frames_per_second, 1.0), MAX_RATE), 2)
-        places = [round((time_s - times[0]) * rate) for time_s in times]
-        if frames_per_second >= MAX_RATE or all(one < other for one, other in pairwise(places)):
-            return places, rate
-        frames_per_second *= 2
-
-
-def _write_overlay(pictures: Iterator[Bytes3], video: Path, places: list[int], rate: float) -> None:
-    """Writes a video in which each picture stays until the place of the next."""
-    temporary = video.with_name(".overlay.part.mp4")
+    video, temporary = out / OVERLAY, out / ".overlay.part.mp4"
+    places, rate = _places(times, frames_per_second)
     writer: Any = None  # OpenCV has no types
     try:
-        for picture, place, following in zip(pictures, places, [*places[1:], places[-1] + 1], strict=True):
+        for (index, frame), place, following in zip(frames, places, [*places[1:], places[-1] + 1], strict=True):
+            flow = np.zeros((*frame.shape[:2], 2), np.float32)
+            if index > 0:
+                field = read_flow(flow_file(out, index))
+                flow = certain(field.flow, field.sigma)
+            image = in_unit_range(frame)
+            picture = draw_overlay(to_bytes(full_range(image, image)[0]), flow, scale_px)
             if writer is None:
                 size = (picture.shape[1], picture.shape[0])
                 with quiet():
@@ -252,6 +240,20 @@ def _write_overlay(pictures: Iterator[Bytes3], video: Path, places: list[int], r
         os.replace(temporary, video)
     finally:
         temporary.unlink(missing_ok=True)
+    return video
+
+
+def _places(times: list[float], frames_per_second: float) -> tuple[list[int], float]:
+    """Numbers of the frames in a video of a constant rate, and the rate, as fine as keeps the frames apart.
+
+    OpenCV writes no time stamps. MPEG-4 takes no rates above `MAX_RATE`, and no finer fractions.
+    """
+    while True:
+        rate = round(min(max(frames_per_second, 1.0), MAX_RATE), 2)
+        places = [round((time_s - times[0]) * rate) for time_s in times]
+        if frames_per_second >= MAX_RATE or all(one < other for one, other in pairwise(places)):
+            return places, rate
+        frames_per_second *= 2
 
 
 def flow_file(out: Path, index: int) -> Path:
@@ -259,6 +261,11 @@ def flow_file(out: Path, index: int) -> Path:
     return out / "flow" / f"{index:06d}.exr"
 
 
-def earlier_flows(out: Path) -> list[Path]:
-    """What an earlier run wrote, which may have had other frames: files named by six digits or more."""
-    return [path for path in (out / "flow").glob("*.exr") if re.fullmatch(r"[0-9]{6,}", path.stem)]
+def earlier_files(out: Path) -> list[Path]:
+    """Flows and markers that an earlier run left; InputError where a file that a run replaces is somebody else's."""
+    flows = [path for path in (out / "flow").glob("*.exr") if re.fullmatch(r"[0-9]{6,}", path.stem)]
+    refuse_foreign(out / MOTIONS, MOTIONS_BEGIN, out / OVERLAY)
+    refuse_foreign(out / MARKERS, MARKERS_BEGIN)
+    for flow in flows:
+        refuse_foreign(flow, DIRECTIONS.encode())
+    return [path for path in (*flows, out / MARKERS) if path.exists()]

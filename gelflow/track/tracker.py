@@ -4,8 +4,8 @@ The start of a frame is the last flow, moved on by what DIS sees between the las
 ``V(x) = U(x) + D(x + U(x))``. Registration between the reference and the frame then corrects it, so that errors do not
 add up, and motion may grow beyond what a direct flow finds. Where the result tears more of the picture than before, as
 one does that took dots for the next ones, starts that know nothing of the stream compete with it: DIS from the
-reference, and a network if that tears, too (`gelflow.fast.start`). After a frame in which most of the picture is lost,
-such as a cut or one of a ramp of exposure, the next one starts afresh.
+reference, and a network if that tears, too (`gelflow.fast.start`). What they lead to must tear clearly less. After a
+frame in which most of the picture is lost, such as a cut or one of a ramp of exposure, the next one starts afresh.
 """
 
 import math
@@ -33,6 +33,8 @@ TRACKING = (STAGES[0], STAGES[-1])
 """Stages from the last flow on. The first smooths it, so that errors between marks do not add up over frames."""
 RETRY = 10
 """Frames after which they compete again for what the last ones left."""
+CLEARLY_LESS = 0.5
+"""Share of what the followed flow tears below which a fresh one replaces it; it may have jumped where they are near."""
 CUT = 0.5
 """Share of the picture that is lost in a frame which has nothing to do with the one before."""
 
@@ -118,22 +120,24 @@ class Tracker:
 
     def _follow(self, image: ImageArray) -> tuple[Refined, bool]:
         """The flow to a frame, and whether it started afresh."""
-        second, flows = Prepared(image), list[FlowArray]()
+        second, flows, afresh = Prepared(image), list[FlowArray](), self._last is None
         self._since += 1
         if self._last is not None:
             before, last = self._last
             flows.append(_moved_on(before, last.flow, second))
             found = refined(register(flows[0], self._first, second, TRACKING), self._first, second, last)
             self._accepted = min(self._accepted, found.torn)
-        if self._last is None or found.torn > (self._accepted if self._since < RETRY else 0.0) + MOST_TORN:
+        if afresh or found.torn > (self._accepted if self._since < RETRY else 0.0) + MOST_TORN:
             start = fresh_start(self._first, second, flows, self._network)
-            found = refined(register(start, self._first, second, STAGES[1:]), self._first, second)
+            fresh = refined(register(start, self._first, second, STAGES[1:]), self._first, second)
+            afresh = afresh or fresh.torn < CLEARLY_LESS * found.torn
+            found = fresh if afresh else found
             self._since, self._accepted = 0, found.torn
         if found.lost.mean() > CUT:
             self._last = None
             return found._replace(sigma=np.full_like(found.sigma, MAX_SIGMA_PX)), True
         self._last = (second, found)
-        return found, self._since == 0
+        return found, afresh
 
 
 def _moved_on(before: Prepared, flow: FlowArray, second: Prepared) -> FlowArray:

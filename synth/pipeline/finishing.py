@@ -83,12 +83,13 @@ def _warning(context: JobContext, sample: Sample, view: View, frame: Frame) -> s
 
 def _diagnostics(context: JobContext, simulated: SimulatedTrajectory) -> dict[str, Any]:
     found = simulated.accuracy or accuracy(simulated.scene, context.plan.template.folder)
-    error = None if np.isnan(found.error_px) else round(found.error_px, 4)
+    errors = {"predicted_error_px": found.error_px, "predicted_error_percent": found.error_percent}
+    predicted = {name: None if np.isnan(error) else round(error, 4) for name, error in errors.items()}
     radius, is_mesh = simulated.path.body.fillet_mm, isinstance(simulated.scene.contact.indenter, MeshIndenter)
     more: dict[str, Any] = {"edge_radius_mm": round(radius, 4)} if is_mesh else {}
     if (frame := simulated.path.frame) is not None:
         more["inward_normal"] = frame.axes[:, 2].round(6).tolist()
-    return {**simulated.mesh, "elements_across_contact": found.across, "predicted_error_px": error, **more}
+    return {**simulated.mesh, "elements_across_contact": found.across, **predicted, **more}
 
 
 def _sample(

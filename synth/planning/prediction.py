@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.mesh import default_edge_length
 from synth.mesh.layered import elements_through
@@ -21,8 +22,10 @@ from synth.sampling import draw
 from synth.scene import Gel, MeshIndenter, Scene
 from synth.simulate.solve import VICINITY
 
-_Meshes = tuple[list[tuple[Scene, int]], str, tuple[float, float] | None]
-"""Random instances with their displacement nodes; `Prediction.resolution` and `Prediction.error_px`."""
+_Errors = tuple[float, float] | None
+"""Median and largest."""
+_Meshes = tuple[list[tuple[Scene, int]], str, _Errors, _Errors]
+"""Random instances with their displacement nodes; `Prediction.resolution`, `error_px` and `error_percent`."""
 INSTANCES = 12
 """Trajectories whose meshes are chosen to predict error and time."""
 NODES_PER_VOLUME, NODES_PER_AREA, NODES_PER_CURVED_AREA, FEWEST_NODES = 0.72, 0.25, 2.3, 300
@@ -69,6 +72,8 @@ class Prediction:
         error_px: error of the flow from the simulation: median and largest of INSTANCES trajectories; None where the
             mesh is given by an edge length, for which nothing is predicted.
         target_error_px: what was asked for; None with an edge length.
+        error_percent: the same, of force and displacement; None also for P1/P1 elements.
+        target_error_percent: what was asked for.
         nodes: displacement nodes, mean of the trajectories.
         seconds_per_pair: by stage, on one core; of a clip where samples are clips.
         bytes_per_pair: size on disk; the same.
@@ -77,12 +82,34 @@ class Prediction:
 
     resolution: str
     warning: str
-    error_px: tuple[float, float] | None
+    error_px: _Errors
     target_error_px: float | None
+    error_percent: _Errors
+    target_error_percent: float | None
     nodes: int
     seconds_per_pair: dict[str, float]
     bytes_per_pair: int
     memory_bytes: int
+
+    def error_lines(self) -> list[str]:
+        """What can be said of the simulation's discretisation error: for each kind a line with its target, if any."""
+        if self.error_px is None:
+            return ["the simulation's discretisation error is not predicted for meshes of fTetWild"]
+        flow = _error_line("the flow", "px", self.error_px, self.target_error_px)
+        percent = self.error_percent
+        if percent is None:
+            return [flow]
+        return [flow, _error_line("force and displacement", "%", percent, self.target_error_percent)]
+
+
+def _error_line(what: str, unit: str, errors: tuple[float, float], target: float | None) -> str:
+    values = f"{errors[0]:.2g} {unit} (median), {errors[1]:.2g} {unit} (largest)"
+    line = f"predicted error of {what} from the simulation: {values}"
+    if target is None:
+        return line
+    if errors[1] > target:
+        return f"{line}; for some trajectories the mesh does not reach the target of {target:g} {unit}"
+    return f"{line}; target {target:g} {unit}"
 
 
 def predict(plan: Plan) -> Prediction:
@@ -94,7 +121,8 @@ def predict(plan: Plan) -> Prediction:
     images, flows = (steps + 1, steps) if sampling.kind == "clips" else (2.0, 1.0)
     rendered = (steps if sampling.kind == "clips" else 1 + 1 / samples) if outputs.images else 0.0
     cameras = [view.camera for view in corner.sensor.views.values()]
-    presses, resolution, error_px = _tetwild_meshes(plan) if plan.mesh.kind == "tetwild" else _meshes(plan)
+    meshes = _tetwild_meshes if plan.mesh.kind == "tetwild" else _meshes
+    presses, resolution, error_px, error_percent = meshes(plan)
     simulate = float(np.mean([_simulation_seconds(scene, nodes, plan) for scene, nodes in presses]))
     pixels = sum(camera.width * camera.height for camera in cameras)
     rays = AUTO_SAMPLES if corner.render.samples_per_pixel == "auto" else corner.render.samples_per_pixel
@@ -110,6 +138,8 @@ def predict(plan: Plan) -> Prediction:
         warning=_lost_detail(plan),
         error_px=error_px,
         target_error_px=None if error_px is None else plan.mesh.target_error_px,
+        error_percent=error_percent,
+        target_error_percent=plan.mesh.target_error_percent,
         nodes=round(nodes),
         seconds_per_pair={
             "simulate": round(simulate / samples, 3),
@@ -152,7 +182,8 @@ def _meshes(plan: Plan) -> _Meshes:
     if not found:
         raise InputError(f"{template.label}: none of {INSTANCES} random instances is possible: {reason}")
     across = [resolution.across for _, resolution in found]
-    errors = [resolution.error_px for _, resolution in found]
+    px = np.array([resolution.error_px for _, resolution in found])
+    percent = np.array([resolution.error_percent for _, resolution in found])
     spacings = [resolution.spacing_mm for _, resolution in found]
     text = f"{min(across)} to {max(across)} elements across the contact, {min(spacings):.2g} to {max(spacings):.2g} mm"
     if plan.mesh.kind == "even":
@@ -162,7 +193,11 @@ def _meshes(plan: Plan) -> _Meshes:
     if rounded:
         text += f", edges of objects rounded to {min(rounded):.2g} to {max(rounded):.2g} mm"
     presses = [(scene, round(_order(scene) * len(resolution.mesh.points))) for scene, resolution in found]
-    return presses, text, (float(np.median(errors)), max(errors))
+    return presses, text, _spread(px), None if np.isnan(percent).any() else _spread(percent)
+
+
+def _spread(errors: FloatArray) -> tuple[float, float]:
+    return float(np.median(errors)), float(errors.max())
 
 
 def _tetwild_meshes(plan: Plan) -> _Meshes:
@@ -176,7 +211,7 @@ def _tetwild_meshes(plan: Plan) -> _Meshes:
     vertices += NODES_PER_CURVED_AREA * x * y * sum(elements_through(gel.layers_mm, edge_mm))
     nodes = max(FEWEST_NODES, round(_order(first) * vertices))
     text = f"fTetWild meshes with edges of {edge_mm:g} mm at the contact face"
-    return [(corner, nodes) for corner in plan.template.corners], text, None
+    return [(corner, nodes) for corner in plan.template.corners], text, None, None
 
 
 def _plate(gel: Gel) -> tuple[float, float, float]:

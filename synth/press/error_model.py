@@ -11,9 +11,19 @@ the indenter's surface meets the gel), T thickness of the pad, s shear, theta tw
 zone, mu friction, k a number for each shape of indenter and c a factor for certainty. The powers of the lengths add up
 to two: a press of twice the size errs by twice as much, on the same mesh of twice the size.
 
+Relative to the displacement of the face, which is about 2 g a √(d² + ((m - d) / 2)²) in L2, the error is
+
+.. math::  e = \frac{c \, (T / a)^{0.35} \, E}{2 g a \sqrt{d^2 + ((m - d) / 2)^2}}
+
+with a the zone's half width (geometric mean of its two), and g a number for each shape. E is of what a camera sees of
+presses with friction; without friction, and with z, the error of small contacts is larger by the power of T / a. The
+relative error of the contact force was half of the displacement's in the mean; where elements are wider than an edge's
+band, about the same. e stands for both.
+
 The powers were set by hand near those of free fits, which predict other trajectories hardly better; k was fitted
 (docs/reports/budget.md). Covered are flat pads of 2.5 to 16 mm and a dome, depths to 40 % of the thickness, friction of
-0.3 to 1, elements 0.4 to 2.7 b wide; all but one of the pads are incompressible.
+0.3 to 1, elements 0.4 to 2.7 b wide; all but one of the pads are incompressible. e was fitted to fewer presses
+(docs/reports/force_budget.md).
 """
 
 import numpy as np
@@ -37,6 +47,10 @@ ERROR_SCALES = {
 have if their band is taken for as wide as a mesh's."""
 CERTAINTY = 1.1
 """Factor on the model's mean. It weighs meshes too coarse against meshes too dear (docs/decisions.md)."""
+DISPLACED = {"sphere": 0.6, "cone": 0.6, "bar": 0.6, "punch": 0.9, "box": 0.9, "torus": 0.3, "mesh": 0.3}
+"""g of the error model: how much of the zone an indenter carries along. Of a mesh it is the least of the others."""
+RELATIVE = 1.8
+"""c of the relative error, a third above the mean: a budget should hold for most presses, not for half."""
 
 
 def face_error(scene: Scene, focus: Focus, spacing_mm: float) -> float:
@@ -44,17 +58,38 @@ def face_error(scene: Scene, focus: Focus, spacing_mm: float) -> float:
 
     `spacing_mm` is the size of the elements under the contact, as `synth.press.resolution` has it.
     """
-    motion, indenter = scene.motion, scene.contact.indenter
-    poses = motion.stops.values()
-    depth = max(pose.depth_mm for pose in poses)
+    indenter = scene.contact.indenter
+    depth, drag = _moves(scene, focus)
     if depth <= 0:
         return 0.0
-    width = max(focus.half_mm)
-    drag = max(2 * np.hypot(*pose.shear_mm) + width * abs(np.radians(pose.twist_deg)) for pose in poses)
-    moved = depth + np.sqrt(min(scene.contact.friction, 1.0)) * drag
+    moved = depth + drag
     rim, band = _rim(indenter, focus), _band(indenter, focus, depth)
     scale = CERTAINTY * ERROR_SCALES[_class_of(indenter)] * scene.sensor.gel.size_mm[2] ** -0.6
     return float(scale * np.sqrt(rim / band * depth * moved) * spacing_mm**RATE)
+
+
+def error_percent(scene: Scene, focus: Focus, spacing_mm: float) -> float:
+    """Error of force and displacement in percent, e of the model, with the arguments of `face_error`.
+
+    NaN for P1/P1 elements, for which nothing is known.
+    """
+    if scene.numerics.element == "p1p1":
+        return float("nan")
+    depth, drag = _moves(scene, focus)
+    if depth <= 0:
+        return 0.0
+    half = np.sqrt(np.prod(focus.half_mm))
+    moved = DISPLACED[_class_of(scene.contact.indenter)] * 2 * half * np.hypot(depth, drag / 2)
+    small = (scene.sensor.gel.size_mm[2] / half) ** 0.35
+    return float(100 * RELATIVE * small * face_error(scene, focus, spacing_mm) / moved)
+
+
+def _moves(scene: Scene, focus: Focus) -> tuple[float, float]:
+    """Depth d of the press and what friction drags the gel, m - d of the module, mm."""
+    poses = scene.motion.stops.values()
+    width = max(focus.half_mm)
+    drag = max(2 * np.hypot(*pose.shear_mm) + width * abs(np.radians(pose.twist_deg)) for pose in poses)
+    return max(pose.depth_mm for pose in poses), float(np.sqrt(min(scene.contact.friction, 1.0)) * drag)
 
 
 def _class_of(indenter: Indenter) -> str:

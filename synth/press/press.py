@@ -87,12 +87,13 @@ class MeshRule:
 
     "graded": around each contact, as fine as the target asks for; "even": `numerics.cells`, the same for all
     trajectories of a pad; "tetwild": by fTetWild, also the same for all: round gels, and others where
-    `numerics.edge_length_mm` is given. The target is the root-mean-square error of the flow that the simulation may
-    leave, NaN for "tetwild", for which nothing is predicted.
+    `numerics.edge_length_mm` is given. The targets are the root-mean-square error of the flow that the simulation may
+    leave, NaN for "tetwild", for which nothing is predicted, and the error of force and displacement, if one is set.
     """
 
     kind: Literal["graded", "even", "tetwild"]
     target_error_px: float
+    target_error_percent: float | None = None
 
     @classmethod
     def of(cls, scene: Scene, is_batched: bool = False) -> "MeshRule":
@@ -100,7 +101,8 @@ class MeshRule:
         numerics = scene.numerics
         if numerics.edge_length_mm is not None or scene.sensor.gel.is_round:
             return cls("tetwild", float("nan"))
-        return cls("even" if is_batched else "graded", numerics.target_error_px or DEFAULT_TARGET_PX)
+        kind: Literal["even", "graded"] = "even" if is_batched else "graded"
+        return cls(kind, numerics.target_error_px or DEFAULT_TARGET_PX, numerics.target_error_percent)
 
     def resolution(
         self, scene: Scene, folder: Path | None = None, mesh_folders: Sequence[Path] | None = None
@@ -112,14 +114,15 @@ class MeshRule:
         gel, numerics = scene.sensor.gel, scene.numerics
         match self.kind:
             case "graded":
-                return resolve(scene, folder, self.target_error_px)
+                return resolve(scene, folder, self.target_error_px, self.target_error_percent)
             case "even":
                 found = accuracy(scene, folder)
                 mesh, spacing = shared_mesh(gel, numerics), shared_spacing_mm(gel, numerics)
-                return Resolution(found.across, found.error_px, mesh, numerics.cells[2], spacing)
+                return Resolution(**vars(found), mesh=mesh, through=numerics.cells[2], spacing_mm=spacing)
             case "tetwild":
                 mesh = pad_mesh(gel, numerics, mesh_folders, folder)
-                return Resolution(0, float("nan"), mesh, 0, numerics.edge_length_mm or default_edge_length(gel))
+                edge_mm = numerics.edge_length_mm or default_edge_length(gel)
+                return Resolution(0, float("nan"), float("nan"), mesh, 0, edge_mm)
 
     def check_edges(self, scene: Scene, mesh: PadMesh) -> None:
         """InputError where the indenter's edges are stated to be sharper than a mesh resolves."""
@@ -172,4 +175,4 @@ class MeshRule:
             return Press.of(scene, mesh, folder)
         found = self.resolution(scene, folder, mesh_folders)
         self.check_edges(scene, found.mesh)
-        return Press.of(scene, found.mesh, folder, Accuracy(found.across, found.error_px))
+        return Press.of(scene, found.mesh, folder, Accuracy(found.across, found.error_px, found.error_percent))

@@ -2,8 +2,9 @@
 
 The mesh is structured and graded around where its indenter will touch: `across` elements across the contact,
 as many through the thickness as keep elements under the contact about as high as wide. It is the cheapest mesh whose
-predicted error is within the budget; the prediction (`synth.press.error_model`) was calibrated, and is tested,
-against much finer solutions (docs/reports/budget.md).
+predicted errors are within the budgets, of the flow in px and, where one is set, of force and displacement in percent;
+the predictions (`synth.press.error_model`) were calibrated, and are tested, against much finer solutions
+(docs/reports/budget.md).
 
 Draws of a pad that are simulated many at once share one mesh, wherever their indenters touch: it is even along x and y,
 `numerics.cells` says how fine, and graded through the thickness so that elements at the contact face are about as high
@@ -24,7 +25,7 @@ from synth.mesh.element import Element, p1p1, p2p1
 from synth.mesh.face import face_height
 from synth.mesh.graded import spacing
 from synth.optics import Optics
-from synth.press.error_model import face_error
+from synth.press.error_model import error_percent, face_error
 from synth.press.footprint import footprint
 from synth.press.posed_path import PosedPath
 from synth.press.scene_path import path_of
@@ -33,7 +34,7 @@ from synth.scene import Gel, MeshIndenter, Numerics, Scene
 ELEMENTS_ACROSS = (4, 6, 8, 10, 12, 14, 16)
 """Elements across the contact to choose from."""
 FINER = (20, 24, 32)
-"""More of them, for a stated `fillet_mm` alone: they take minutes."""
+"""More of them, for a stated `fillet_mm` or a target in percent alone: they take minutes."""
 CONTACT_ACROSS = 12
 """Fewest elements across the contact where outputs.contact or slip asks for its edge."""
 ELEMENTS: dict[str, Callable[[], Element]] = {"auto": p2p1, "p1p1": p1p1, "p2p1": p2p1}
@@ -51,15 +52,16 @@ OUTER = (3, 2)
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How well a mesh resolves one trajectory, and the predicted root-mean-square error of the flow over the contact
-    face.
+    """How well a mesh resolves one trajectory, and the predicted errors: of the flow over the contact face, root mean
+    square in px, and of force and displacement in percent (`synth.press.error_model.error_percent`).
 
     `across` are whole elements across the contact, along its shorter side; 0 where less than one. Of an fTetWild mesh
-    elements are not counted, and the error is NaN.
+    elements are not counted, and the errors are NaN.
     """
 
     across: int
     error_px: float
+    error_percent: float
 
 
 @dataclass(frozen=True)
@@ -211,11 +213,13 @@ def _focus(scene: Scene, folder: Path | None) -> tuple[Focus, Scene]:
     return footprint(path, scene.sensor.gel.size_mm, MARGIN), whole
 
 
-def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolution:
+def resolve(
+    scene: Scene, folder: Path | None, target_error_px: float, target_error_percent: float | None = None
+) -> Resolution:
     """The cheapest graded mesh of a scene instance that is fine enough, else the finest.
 
-    Its predicted error of the flow is within the target, it resolves a stated `fillet_mm`, and the contact's edge where
-    that is asked for. InputError where the indenter, whose mesh file is relative to `folder`, or the mesh cannot be
+    Its predicted errors are within both targets, it resolves a stated `fillet_mm`, and the contact's edge where that is
+    asked for. InputError where the indenter, whose mesh file is relative to `folder`, or the mesh cannot be
     built.
     """
     gel = scene.sensor.gel
@@ -223,14 +227,15 @@ def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolu
     stated = getattr(scene.contact.indenter, "fillet_mm", None)
     least = CONTACT_ACROSS if scene.outputs.contact or scene.outputs.slip else 0
     usual = mesh_levels(gel, focus)
-    finer = [] if stated is None else mesh_levels(gel, focus, FINER)
+    finer = [] if stated is None and target_error_percent is None else mesh_levels(gel, focus, FINER)
     for number, fineness in enumerate([*usual, *finer], 1):
         mesh, fine = graded_mesh(gel, focus, *fineness)
-        error = predicted_error_px(scene, focus, fine)
+        error, percent = predicted_error_px(scene, focus, fine), error_percent(scene, focus, fine)
         enough = number >= len(usual) or (error <= target_error_px and fineness.across >= least)
+        enough = enough and (target_error_percent is None or percent <= target_error_percent)
         if enough and (stated is None or resolution_mm(scene, mesh.spacing_mm) <= stated):
             break
-    return Resolution(fineness.across, error, mesh, fineness.through, fine)
+    return Resolution(fineness.across, error, percent, mesh, fineness.through, fine)
 
 
 def shared_mesh(gel: Gel, numerics: Numerics) -> PadMesh:
@@ -269,5 +274,7 @@ def accuracy(scene: Scene, folder: Path | None = None) -> Accuracy:
     """What the shared mesh gives for one instance; InputError where the indenter cannot be built."""
     gel, numerics = scene.sensor.gel, scene.numerics
     focus, scene = _focus(scene, folder)
-    error = predicted_error_px(scene, focus, shared_spacing_mm(gel, numerics))
-    return Accuracy(int(2 * min(focus.half_mm) / _width(gel.size_mm, numerics.cells)), error)
+    spacing_mm = shared_spacing_mm(gel, numerics)
+    across = int(2 * min(focus.half_mm) / _width(gel.size_mm, numerics.cells))
+    errors = predicted_error_px(scene, focus, spacing_mm), error_percent(scene, focus, spacing_mm)
+    return Accuracy(across, *errors)

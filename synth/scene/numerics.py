@@ -34,6 +34,10 @@ class Numerics(Part):
     target_error_px: Positive | None = None
     """Root-mean-square error that the flow over the seen face may have from the simulation; default 0.5. The mesh is
     made as fine under each trajectory's contact as this asks for."""
+    target_error_percent: Annotated[float, Field(ge=0.1, le=50)] | None = None
+    """Error that the simulation may leave in the contact force, and in the displacement of the contact face (relative
+    L2), each in percent of the largest of the press; default: no limit. The mesh is the finer of those that this and
+    target_error_px ask for."""
     edge_length_mm: Positive | None = None
     """Instead of a target: one fTetWild mesh for all trajectories with tetrahedra of this edge at the contact face."""
     solver: Literal["auto", "single", "batched"] = "auto"
@@ -54,4 +58,9 @@ class Numerics(Part):
     def _one_resolution(self) -> "Numerics":
         if self.target_error_px is not None and self.edge_length_mm is not None:
             raise ValueError("target_error_px and edge_length_mm both fix the mesh: give one of them")
+        if self.target_error_percent is not None and (self.edge_length_mm is not None or self.element == "p1p1"):
+            raise ValueError(
+                f"target_error_percent = {self.target_error_percent:g} is predicted for meshes of its own, of P2/P1 "
+                'elements: leave out edge_length_mm, and element = "p1p1"'
+            )
         return self

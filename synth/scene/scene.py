@@ -104,6 +104,11 @@ class Scene(Part):
                 f"motion.steps = {motion.steps} cannot record every pose of motion.then: there are {moves} "
                 f"moves, press and shear among them, and each needs a step; at least {moves}"
             )
+        if gel.is_round and self.numerics.target_error_percent is not None:
+            raise ValueError(
+                f'numerics.target_error_percent: for a "{gel.shape}" gel no error is predicted; leave it out, and give '
+                "edge_length_mm"
+            )
         edge, thinnest = self.numerics.edge_length_mm, min(*size, gel.depth_mm)
         if edge is not None and not thinnest / 60 <= edge <= thinnest:
             raise ValueError(

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.error import HTTPError
@@ -24,11 +25,12 @@ from gelflow.cli.prediction import show_live
 from gelflow.errors import InputError
 from gelflow.files import video as video_files
 from gelflow.files.exr import read_flow
-from gelflow.files.video import newest_frames
+from gelflow.files.video import describe, newest_frames
 from gelflow.methods.fast import Fast
 from gelflow.predict.live import LiveFlow, Pace, follow
 from gelflow.predict.page import Page
 from gelflow.predict.prediction import motion_of
+from gelflow.predict.recording import Recording
 from gelflow.predict.stream import Stream
 
 FARNEBACK = named_methods(["farneback"])[0]
@@ -136,8 +138,36 @@ def test_a_recording_has_the_files_of_predict(tmp_path: Path, capsys) -> None:
     last = read_flow(flows[-1])
     assert last.sigma is not None
     assert np.median(last.flow[..., 0]) == pytest.approx(7, abs=1)
+    assert not list(out.glob("*.tmp")) + list(out.glob(".*"))
+    info, shown = describe(out / "overlay.mp4"), [frame for _, _, frame in video_files.frames(out / "overlay.mp4")]
+    # From the first flow on; of frames left out the rate is lower, by which the last one's stay is longer.
+    assert info.frames / info.frames_per_second == pytest.approx(0.1 * (8 - int(rows[0]["frame"])), abs=0.1)
     assert main(["predict", path, *options]) == 0
     assert list(table(out / "motion.csv")[0]) == list(rows[0])
+    *_, (_, _, last_shown) = video_files.frames(out / "overlay.mp4")
+    # Both show frame 7 and the flow to it at the scale of the largest motion; JPEG and MPEG-4 err by grey levels.
+    assert np.abs(shown[-1].astype(float) - last_shown).mean() < 3
+
+
+def test_writing_a_recording_takes_no_line_from_the_output(tmp_path: Path, capfd) -> None:
+    recording, flow = Recording(tmp_path / "out"), dotted(3.0)
+    for number in range(1, 100):
+        recording.add(flow.frame, flow.found, replace(flow.motion, frame=number, time_s=number / 10))
+        print(number, flush=True)
+    recording.close()
+    assert capfd.readouterr().out.split() == [str(number) for number in range(1, 100)]
+
+
+def test_a_source_that_does_not_open_replaces_no_recording(tmp_path: Path) -> None:
+    out, path = tmp_path / "out", str(video(tmp_path / "a.avi", 10.0))
+    options = ["--method", "farneback", "--out", str(out), "--markers", str(out / "markers.csv")]
+    assert main(["live", path, *options]) == 0
+    files = {file: file.read_bytes() for file in out.rglob("*") if file.is_file()}
+    assert {"markers.csv", "motion.csv", "overlay.mp4"} < {file.name for file in files}
+    assert main(["live", str(tmp_path / "none.avi"), *options]) == 2
+    assert {file: file.read_bytes() for file in out.rglob("*") if file.is_file()} == files
+    assert main(["live", path, *options[:-2]]) == 0
+    assert not (out / "markers.csv").exists()  # it would be of another run
 
 
 def test_a_reader_that_is_left_ends_before_its_frames_do(tmp_path: Path) -> None:

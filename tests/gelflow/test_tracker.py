@@ -73,6 +73,21 @@ def test_a_ramp_of_exposure_is_unknown_asks_no_network_and_the_stream_goes_on(mo
     assert not found[-1].afresh
 
 
+def test_a_fresh_start_that_jumps_by_a_pitch_and_tears_no_less_is_not_taken(monkeypatch) -> None:
+    axes = (np.arange(-4, 14) * PITCH for _ in SIZE)
+    dots = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    tracker, motion = gelflow.Tracker(frame(dots=dots)), Turn(shift=(4.0, 0.0))
+    tracker.update(frame(shift=(2.0, 0.0), dots=dots))
+    jumped = np.full((*SIZE, 2), (4.0 - PITCH, 0.0), np.float32)
+    monkeypatch.setattr("gelflow.track.tracker.fresh_start", lambda *_: jumped)
+    broken = motion.frame(*SIZE, dots)
+    broken[40:90, 60:120] = as_bytes(moved(50, 60, 0, 0))
+    found = tracker.update(broken)
+    # A tenth of the picture is torn under both flows; 0.1 px is the limit of the tests above.
+    assert off(found.flow, motion) < 0.1
+    assert not found.afresh
+
+
 def test_a_stream_that_begins_in_contact_counts_motion_from_there() -> None:
     tracker = gelflow.Tracker(frame(turn=3.0, shift=(4.0, 0.0)))
     found = tracker.update(frame(turn=3.0, shift=(6.0, 0.0)))

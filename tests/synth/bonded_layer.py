@@ -84,17 +84,26 @@ def kappa(radius: float, thickness: float, poisson_ratio: float = 0.5) -> float:
     return float(force[0] * (1 - poisson_ratio**2) / (2 * radius))
 
 
-def ball_at(contact: float, radius: float, thickness: float, poisson_ratio: float = 0.5) -> tuple[float, float]:
+def flat_and_sphere(x: FloatArray, radius: float) -> FloatArray:
+    """The same (n, 2) of a true sphere, which is steeper than its parabola: R x artanh(x/R) in place of x²."""
+    return np.column_stack([np.ones_like(x), radius * x * np.arctanh(x / radius)])
+
+
+def ball_at(
+    contact: float, radius: float, thickness: float, poisson_ratio: float = 0.5, right: Callable = flat_and_ball
+) -> tuple[float, float]:
     """Depth δ and force over E of a ball whose contact radius is `contact`."""
-    force, edge = respond(contact, thickness, poisson_ratio)
+    force, edge = respond(contact, thickness, poisson_ratio, right)
     depth = edge[1] / (edge[0] * radius)
     return float(depth), float(depth * force[0] - force[1] / radius)
 
 
-def ball(depth: float, radius: float, thickness: float, poisson_ratio: float = 0.5) -> tuple[float, float]:
+def ball(
+    depth: float, radius: float, thickness: float, poisson_ratio: float = 0.5, right: Callable = flat_and_ball
+) -> tuple[float, float]:
     """Contact radius a and force over E of a ball pressed `depth` deep."""
     half_space = np.sqrt(radius * depth)  # a layer widens the contact, to twice that at most
-    found = partial(ball_at, radius=radius, thickness=thickness, poisson_ratio=poisson_ratio)
+    found = partial(ball_at, radius=radius, thickness=thickness, poisson_ratio=poisson_ratio, right=right)
     contact = brentq(lambda a: found(a)[0] - depth, 0.9 * half_space, 2 * half_space, xtol=1e-12)
     return float(contact), found(contact)[1]
 

@@ -111,6 +111,7 @@ def test_one_trajectory_alone_is_the_same_failed_draws_are_replaced_and_the_mesh
     first, scene = told[0], dataset.scene_of(0)
     assert first["mesh"] == shared_mesh(scene.sensor.gel, scene.numerics).hash
     assert first["predicted_error_px"] == round(accuracy(scene).error_px, 4)
+    assert first["predicted_error_percent"] is None, "nothing is known of P1/P1 elements"
 
 
 def test_a_batch_agrees_with_the_single_solver_and_hopeless_trajectories_are_given_up(context: JobContext) -> None:

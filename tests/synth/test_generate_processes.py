@@ -19,7 +19,7 @@ from processes_of import PATIENCE_S, end_family, lines, needs_proc, own_words, s
 from tiny_scene import fingerprint, reference
 
 from synth.cli import main
-from synth.dataset import storage
+from synth.dataset import atomic_files
 from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, generate
 from synth.scene.template import load_scene
@@ -184,7 +184,7 @@ def test_storage_that_refuses_in_the_middle(tiny: Path, out: Path, monkeypatch: 
         rename(source, target)
 
     with monkeypatch.context() as patch:
-        patch.setattr(storage.os, "rename", refusing)
+        patch.setattr(atomic_files.os, "rename", refusing)
         with pytest.raises(InputError, match=r"000002: cannot be written: Permission denied.*the same command again"):
             generate(template, 5, out)
     # Both samples of a trajectory are recorded together: 0 and 1 are on record, 2 is not.

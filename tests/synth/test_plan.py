@@ -37,6 +37,13 @@ def test_the_public_interface_plans_a_scene_and_decides_the_mesh_rule_with_its_t
     graded, even = (plan(load_scene(tiny, [numerics]), LLVM) for numerics in ("numerics={}", batched))
     assert (graded.mesh, graded.is_batched) == (MeshRule("graded", DEFAULT_TARGET_PX), False)
     assert (even.mesh, even.is_batched) == (MeshRule("even", 0.7), True)
+    both = plan(load_scene(tiny, ["numerics={ target_error_px = 2.0, target_error_percent = 9.0 }"]), LLVM)
+    assert both.mesh == MeshRule("graded", 2.0, 9.0)
+    flow, force = predict(both).error_lines()
+    assert flow.endswith("; target 2 px")
+    assert "of force and displacement" in force
+    assert force.endswith("% (largest); target 9 %")
+    assert predict(graded).error_lines()[1].endswith("% (largest)"), "predicted, with no target"
     wild = plan(load_scene(tiny), LLVM).mesh
     assert wild.kind == "tetwild"
     assert np.isnan(wild.target_error_px)

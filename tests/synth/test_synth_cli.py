@@ -139,7 +139,7 @@ def test_generate_says_what_it_did_and_a_job_that_partly_fails_has_status_1(said
     ("file", "is a file"),
     ("foreign", "not a dataset: holds thesis.tex"),
     ("another job", "seed: 0 there, 5 now"),
-    ("below a file", "NotADirectoryError"),
+    ("below a file", "cannot be written: Not a directory"),
     ("not writable", "cannot be written"),
 ])  # fmt: skip
 def test_places_that_cannot_take_the_dataset(complaint: Run, tiny, tmp_path, kind: str, says: str) -> None:

@@ -4,16 +4,34 @@ Elements, contact and multipliers together, at depths at which the layer is line
 integral equation, is itself held against published values.
 """
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import pyvista as pv
-from bonded_layer import ball_ratio, body, compliance, disc, growing, kappa, lowered, press, punch_disc, respond, waves
+from bonded_layer import (
+    ball,
+    ball_ratio,
+    body,
+    compliance,
+    disc,
+    flat_and_sphere,
+    growing,
+    kappa,
+    lowered,
+    press,
+    punch_disc,
+    respond,
+    waves,
+)
+from pads import scene
 from scipy.optimize import brentq
 
 from synth.arrays import FloatArray
 from synth.mesh.element import p1p1, p2p1
+from synth.press.press import MeshRule
+from synth.simulate import simulate
 
 LINEAR = 0.005
 """Depth over thickness; finite strain changes the force by some 0.2 % there (see the vanishing depth below)."""
@@ -31,6 +49,19 @@ def test_ball_on_a_layer(radius: float, nu: float) -> None:
     """Contact radii of 0.4, 0.8 and 1.9 thicknesses, where an incompressible layer is 1.4 to 10 times a half space."""
     # Four elements across the contact leave 0.1 to 1 %; foams (nu < 0.3), without a pressure field, half as much again.
     assert ball_ratio(p2p1(), nu, radius, LINEAR, 4) == pytest.approx(1.0, abs=0.012 if nu >= 0.3 else 0.015)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("radius", "depth", "thickness"), [(3.0, 0.1, 3.0), (6.0, 0.05, 2.5)])
+def test_a_target_of_force_holds_for_a_shallow_touch(radius: float, depth: float, thickness: float) -> None:
+    """By the mesh rule of a scene, where the default leaves 3 to 6 % of the force."""
+    numerics = {"element": "auto", "edge_length_mm": None, "target_error_percent": 1.0}
+    touch = scene((20.0, 20.0, thickness), indenter={"shape": "sphere", "radius_mm": radius}, friction=0.0,
+                  motion={"depth_mm": depth, "steps": 1}, numerics=numerics)  # fmt: skip
+    force = simulate(touch, MeshRule.of(touch).resolution(touch).mesh).states[-1].force_n[2]
+    _, exact = ball(depth, radius, thickness, touch.sensor.gel.poisson_ratio, partial(flat_and_sphere, radius=radius))
+    # 1 % is asked of the finite elements. The rest is finite strain: 0.5 % at contacts of a fifth of the radius.
+    assert force / exact == pytest.approx(touch.sensor.gel.youngs_modulus_kpa / 1000, rel=0.015)
 
 
 @pytest.mark.parametrize("nu", [0.2, 0.5])
