@@ -7,7 +7,7 @@ derived again.
 """
 
 import signal
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
@@ -48,7 +48,7 @@ def verify_dataset(path: Path | str, progress: Callable[[int, int], None] | None
     one, reports = partial(_verify_files, dataset), []
     processes = min(workers, len(dataset) // _WORTHWHILE)
     with ExitStack() as stack:
-        found = map(one, dataset.samples)
+        found: Iterator[SampleReport] = map(one, dataset.samples)
         if processes > 1:
             ignored = (signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends this process, and this one those
             pool = ProcessPoolExecutor(processes, get_context("spawn"), signal.signal, ignored)
