@@ -14,6 +14,8 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import BaseContext, ForkServerContext, ForkServerProcess
 from multiprocessing.process import BaseProcess
@@ -113,13 +115,25 @@ def resident(
     if room is None:
         room = int(SHARE_OF_MEMORY * torch.cuda.mem_get_info(device)[0])
     samples: list[Sample] = []
-    for sample in DataLoader(pairs, batch_size=None, **loading):
-        packed = {key: _packed(value) for key, value in sample.items()}
-        room -= sum(value.nbytes for value in packed.values() if isinstance(value, Tensor))
-        if room < 0:
-            return None
-        samples.append({key: value.to(device) if isinstance(value, Tensor) else value for key, value in packed.items()})
+    with _one_thread():
+        for sample in DataLoader(pairs, batch_size=None, **loading):
+            packed = {key: _packed(value) for key, value in sample.items()}
+            room -= sum(value.nbytes for value in packed.values() if isinstance(value, Tensor))
+            if room < 0:
+                return None
+            samples.append({key: v.to(device) if isinstance(v, Tensor) else v for key, v in packed.items()})
     return ResidentPairs(samples)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Single images keep no more threads of PyTorch busy: dozens spin, and for minutes where two runs share a host."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _packed(value: Any) -> Any:
