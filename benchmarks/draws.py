@@ -17,7 +17,8 @@ from multiprocessing import get_context
 
 from benchmarks.rows import Row, arguments, machine, measure, show
 from synth.errors import InputError
-from synth.pipeline.batched_simulation import BATCH, pad_key
+from synth.pipeline.batched_simulation import BATCH
+from synth.pipeline.pads import pad_key
 from synth.press.press import BLUNTER, MeshRule, Press, blunter
 from synth.sampling import draw, samples_of
 from synth.scene.template import SCENES, load_scene

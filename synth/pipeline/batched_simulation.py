@@ -2,7 +2,7 @@
 
 Tasks are drawn as the lanes of `synth.simulate.batched` ask for presses, and sorted by their pads; an instance that
 fails is followed by its trajectory's next one. What a trajectory comes out as does not depend on which others ran
-beside it.
+beside it. Bodies from files take some tenths of a second each; beside a GPU, processes make those of first instances.
 
 The trajectories of one sensor are handed on together: its renderer is worth as much as some ten frames. Those that wait
 for one of their sensor's are a few hundred kilobytes each.
@@ -10,20 +10,21 @@ for one of their sensor's are a few hundred kilobytes each.
 
 import os
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
 from functools import partial
 from itertools import count, islice
 
 import warp as wp
 
 from synth.pipeline.attempts import Attempt, Attempts
+from synth.pipeline.pads import Pads, pad_key
 from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory, Task
-from synth.press.press import Press
+from synth.pipeline.worker_pool import Maker, cores, spread
 from synth.sampling import SensorInstance, draw_sensor, sensor_of
-from synth.scene import Gel
+from synth.scene import Gel, MeshIndenter
 from synth.scene.template import Template
 from synth.simulate.batched import simulate_presses
-from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.batched.run import Asked
 
 BATCH = {"cuda": 256, "cpu": 8}
@@ -33,31 +34,14 @@ MOST_DRAWN = 4
 MIN_PER_SENSOR = 16
 """Waiting trajectories of a sensor that are worth building its renderer for; a clip alone is."""
 
+CORES_A_DRAWER = 4
+"""Cores for each process that makes bodies."""
+
 Result = SimulatedTrajectory | Outcome
 """A simulated trajectory, or the record of one whose every instance failed."""
 Drawn = tuple[Attempts, Attempt]
-
-
-class Pads:
-    """The pad that was used last: mesh, tables and preconditioner, which take seconds to prepare."""
-
-    def __init__(self, context: JobContext) -> None:
-        self._device = context.plan.solver_device
-        self._cached: tuple[Gel, Pad] | None = None
-
-    def of(self, press: Press) -> Pad:
-        """The pad of a press; InputError for a mesh that allows no element, or CUDA without cuBLAS or cuSOLVER."""
-        key = pad_key(press)
-        if self._cached is None or self._cached[0] != key:
-            self._cached = None  # gives its memory back first
-            self._cached = key, prepare(press.scene, press.mesh, self._device)
-        return self._cached[1]
-
-
-def pad_key(press: Press) -> Gel:
-    """What presses that may run together have in common, and with it the mesh. Without layers stiffness only scales."""
-    gel = press.scene.sensor.gel
-    return gel if gel.layers else gel.model_copy(update={"youngs_modulus_kpa": 1.0})
+Maybe = tuple[Attempts, Attempt | None]
+"""A trajectory and its next instance, unless that cannot be built."""
 
 
 def in_batches(context: JobContext, tasks: Iterator[Task], batch: int | None) -> Iterator[list[Result]]:
@@ -76,15 +60,19 @@ class _Simulation:
     def __init__(self, context: JobContext, tasks: Iterator[Task], batch: int) -> None:
         self._context, self._tasks, self._batch = context, tasks, batch
         self._pads = Pads(context)
-        self._sensor: tuple[int, SensorInstance] | None = None
         self._again: list[Attempts] = []
         self._given_up: list[Attempts] = []
         self._drawn: dict[Gel, deque[Drawn]] = {}
+        self._firsts = _first_instances(context, self._begun())
         self.open: Counter[int] = Counter()
 
     def __iter__(self) -> Iterator[tuple[int, Result]]:
         if self._context.plan.solver_device == "cuda":  # on a new machine several modules compile at once
             wp.load_module("synth.simulate", "cuda", recursive=True, max_workers=os.cpu_count() or 1)
+        with closing(self._firsts):
+            yield from self._results()
+
+    def _results(self) -> Iterator[tuple[int, Result]]:
         while self._drawn or self._draw():
             for gel in islice(self._drawn, 1):
                 presses = _OfOnePad(partial(self._next, gel))
@@ -113,10 +101,12 @@ class _Simulation:
 
     def _draw(self) -> bool:
         """Draw an instance, of a trajectory whose last one failed if there is one; False when none is left."""
-        if not self._again and not self._begin():
+        if self._again:
+            attempts, attempt = _next_instance(self._again.pop())
+        elif (first := next(self._firsts, None)) is not None:
+            attempts, attempt = first
+        else:
             return False
-        attempts = self._again.pop()
-        attempt = attempts.next(retry=False)
         if attempt is not None:
             self._drawn.setdefault(pad_key(attempt.press), deque()).append((attempts, attempt))
         elif attempts.is_exhausted:
@@ -125,17 +115,39 @@ class _Simulation:
             self._again.append(attempts)
         return True
 
-    def _begin(self) -> bool:
-        task = next(self._tasks, None)
-        if task is None:
-            return False
-        template = self._context.plan.template
-        sensor = sensor_of(template, task[0])
-        if self._sensor is None or self._sensor[0] != sensor:
-            self._sensor = sensor, draw_sensor(template, self._context.job.seed, sensor)
-        self.open[sensor] += 1
-        self._again.append(Attempts(self._context, task, self._sensor[1]))
-        return True
+    def _begun(self) -> Iterator[Attempts]:
+        """Trajectories of which nothing is drawn yet, counted as `open`."""
+        template, seed = self._context.plan.template, self._context.job.seed
+        last: tuple[int, SensorInstance] | None = None
+        for task in self._tasks:
+            sensor = sensor_of(template, task[0])
+            if last is None or last[0] != sensor:
+                last = sensor, draw_sensor(template, seed, sensor)
+            self.open[sensor] += 1
+            yield Attempts(self._context, task, last[1])
+
+
+def _next_instance(attempts: Attempts) -> Maybe:
+    return attempts, attempts.next(retry=False)
+
+
+def _first_instances(context: JobContext, begun: Iterator[Attempts]) -> Generator[Maybe, None, None]:
+    """In any order, by processes where they take long."""
+    if _are_slow(context):
+        workers = max(1, cores() // CORES_A_DRAWER)
+        yield from spread(context, _drawer, begun, workers, number=lambda attempts: attempts.trajectory)
+    else:
+        yield from map(_next_instance, begun)
+
+
+def _are_slow(context: JobContext) -> bool:
+    plan = context.plan
+    bodies = (corner.contact.indenter for corner in plan.template.corners)
+    return plan.solver_device == "cuda" and any(isinstance(body, MeshIndenter) for body in bodies)
+
+
+def _drawer(context: JobContext) -> Maker[Attempts, Maybe]:
+    return _next_instance
 
 
 class _OfOnePad:

@@ -72,7 +72,7 @@ def prefetched(items: Iterable[Item], limit: int) -> Iterator[Iterator[Item]]:
         thread.shutdown(cancel_futures=True)
 
 
-def _finisher_on_one_core(context: JobContext) -> Maker[list[Result]]:
+def _finisher_on_one_core(context: JobContext) -> Maker[list[Result], Outcome]:
     """What a worker process does with a group; on a GPU kernels are compiled while the first group is simulated."""
     render_on_one_core(context.plan)
     session = RenderSession(context)
@@ -81,7 +81,7 @@ def _finisher_on_one_core(context: JobContext) -> Maker[list[Result]]:
     return _finisher(context, session)
 
 
-def _finisher(context: JobContext, session: RenderSession) -> Maker[list[Result]]:
+def _finisher(context: JobContext, session: RenderSession) -> Maker[list[Result], Outcome]:
     def made(result: Result) -> Outcome:
         return result if isinstance(result, Outcome) else finish(context, session.render_frames(result))
 

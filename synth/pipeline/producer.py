@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from synth.errors import InputError
 from synth.pipeline.attempts import Attempts
-from synth.pipeline.batched_simulation import Pads
 from synth.pipeline.finishing import finish
+from synth.pipeline.pads import Pads
 from synth.pipeline.records import JobContext, Outcome
 from synth.pipeline.render_session import RenderSession
 from synth.sampling import draw_sensor, sensor_of

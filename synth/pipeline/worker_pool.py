@@ -39,7 +39,8 @@ from synth.pipeline.records import JobContext, Outcome, Task
 from synth.planning import Plan
 
 Item = TypeVar("Item")
-Maker: TypeAlias = Callable[[Item], Outcome]
+Made = TypeVar("Made")
+Maker: TypeAlias = Callable[[Item], Made]
 """What a worker does with an item."""
 
 MAX_DEATHS = 3
@@ -53,15 +54,15 @@ def outcomes_of_processes(context: JobContext, tasks: Iterator[Task], workers: i
 
 def spread(
     context: JobContext,
-    make: Callable[[JobContext], Maker[Item]],
+    make: Callable[[JobContext], Maker[Item, Made]],
     items: Iterator[Item],
     workers: int,
     number: Callable[[Item], int],
-) -> Generator[Outcome, None, None]:
-    """Outcomes in the order in which they are ready; at most two items per worker are waiting at any time.
+) -> Generator[Made, None, None]:
+    """What is made of items, in the order in which it is ready; at most two items per worker are under way at a time.
 
-    `make` gives, in each worker process, what makes an outcome of an item, and keeps a renderer to one core; like the
-    items it is picklable. `number` gives the trajectory of an item, for messages. InputError where the storage refuses,
+    `make` gives, in each worker process, what does it, and keeps a renderer to one core; like the items it is
+    picklable. `number` gives the trajectory of an item, for messages. InputError where the storage refuses,
     or worker processes die again and again.
     """
     again: deque[Item] = deque()
@@ -86,20 +87,20 @@ def spread(
 
 def _outcomes_of_pool(
     context: JobContext,
-    make: Callable[[JobContext], Maker[Item]],
+    make: Callable[[JobContext], Maker[Item, Made]],
     items: Iterator[Item],
     again: deque[Item],
     workers: int,
-) -> Generator[Outcome, None, None]:
+) -> Generator[Made, None, None]:
     """Outcomes of `again`, then of `items`; when the pool breaks, `again` holds what it had not finished."""
     spawn = get_context("spawn")  # Dr.Jit and Warp do not survive a fork
     parent_death, parents_end = spawn.Pipe(duplex=False)
-    under_way: dict[Future[Outcome], Item] = {}
+    under_way: dict[Future[Made], Item] = {}
     pool = ProcessPoolExecutor(workers, spawn, _begin, (context, make, parent_death, spawn.Lock()))
-    with parent_death, parents_end, one_thread_each(), pool:
+    with parent_death, parents_end, pool:
         try:
             # All begin at once: the first items may be long in coming. Items find out if the pool is broken.
-            with interrupts_blocked(), main_left_out(), contextlib.suppress(OSError, ValueError, BrokenProcessPool):
+            with _starting(), contextlib.suppress(OSError, ValueError, BrokenProcessPool):
                 for _ in range(workers):
                     pool.submit(int)
             while True:
@@ -109,7 +110,7 @@ def _outcomes_of_pool(
                 begins = room and bool(again)
                 if begins:
                     item = again[0]  # not lost should the pool be broken already
-                    with interrupts_blocked(), main_left_out():
+                    with _starting():
                         under_way[_submit(pool, item)] = item
                     again.popleft()
                 if not under_way:
@@ -128,7 +129,14 @@ def _outcomes_of_pool(
             raise
 
 
-def _submit(pool: ProcessPoolExecutor, item: Item) -> Future[Outcome]:
+@contextlib.contextmanager
+def _starting() -> Iterator[None]:
+    """Workers are started meanwhile, by whoever submits; main_left_out comes first: it keeps others from doing so."""
+    with interrupts_blocked(), main_left_out(), one_thread_each():
+        yield
+
+
+def _submit(pool: ProcessPoolExecutor, item: Any) -> Future[Any]:
     try:
         return pool.submit(_work, item)
     except (OSError, ValueError) as error:  # "handle is closed": the pool broke while this call started a worker
@@ -145,15 +153,20 @@ def interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+_main = threading.RLock()
+"""Who starts processes at the time: a job's main thread, or its solver's."""
+
+
 @contextlib.contextmanager
 def main_left_out() -> Iterator[None]:
     """Processes started meanwhile do not import this process's main module."""
-    main = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = main
+    with _main:
+        main = sys.modules["__main__"]
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = main
 
 
 def exit_with_parent(parent_death: Connection) -> None:
@@ -163,12 +176,12 @@ def exit_with_parent(parent_death: Connection) -> None:
     os._exit(1)
 
 
-_maker: Maker[Any]
+_maker: Maker[Any, Any]
 """What a worker process does, set when the process starts."""
 
 
 def _begin(
-    context: JobContext, make: Callable[[JobContext], Maker[Any]], parent_death: Connection, first: Lock
+    context: JobContext, make: Callable[[JobContext], Maker[Any, Any]], parent_death: Connection, first: Lock
 ) -> None:
     global _maker
     threading.Thread(target=exit_with_parent, args=(parent_death,), daemon=True).start()
@@ -183,11 +196,11 @@ def _begin(
     _maker = make(context)
 
 
-def _work(item: Any) -> Outcome:
+def _work(item: Any) -> Any:
     return _maker(item)
 
 
-def _trajectory_maker(context: JobContext) -> Maker[Task]:
+def _trajectory_maker(context: JobContext) -> Maker[Task, Outcome]:
     render_on_one_core(context.plan)
     producer = Producer(context)
     return lambda task: producer.produce(*task)

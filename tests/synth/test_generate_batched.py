@@ -1,6 +1,8 @@
 """Samples by the batched solver: the same whatever ran beside them, and the single solver's within its tolerance."""
 
+import os
 import signal
+import sys
 import threading
 import time
 from collections import Counter
@@ -21,6 +23,7 @@ from synth.dataset.manifest import Failure
 from synth.dataset.reader import read_dataset
 from synth.dataset.shard import Shard
 from synth.errors import InputError
+from synth.pipeline import batched_simulation
 from synth.pipeline.attempts import Attempts
 from synth.pipeline.batched_simulation import in_batches
 from synth.pipeline.generate import Scheduling, generate
@@ -79,6 +82,17 @@ def test_batch_and_shards_change_no_bit(template: Template, whole: Path, tmp_pat
     for number, batch in ((1, 1), (0, 3)):
         generate(template, SAMPLES, out, SEED, scheduling=Scheduling(batch=batch, shard=Shard(number, 2)))
     assert fingerprint(out) == fingerprint(whole)
+
+
+def test_bodies_that_processes_make_are_the_same(
+    template: Template, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a GPU, where objects' bodies would keep it waiting; from the solver's thread, beside the renderers."""
+    monkeypatch.setattr(batched_simulation, "_are_slow", lambda context: True)
+    environment, script = dict(os.environ), sys.modules["__main__"]
+    generate(template, SAMPLES, tmp_path / "d", SEED, scheduling=Scheduling(batch=3, workers=2))
+    assert fingerprint(tmp_path / "d") == fingerprint(whole)
+    assert (dict(os.environ), sys.modules["__main__"]) == (environment, script)
 
 
 @needs_proc
