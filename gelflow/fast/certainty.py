@@ -148,7 +148,7 @@ def _parts(
 def _strain(flow: FlowArray) -> MapArray:
     """The norm of Green's strain (F^T F - 1) / 2 of a flow on cells, F = 1 + grad V; (h, w)."""
     down, across = np.gradient(flow, CELL, axis=(0, 1))
-    (ux, vx), (uy, vy) = np.moveaxis(across, -1, 0), np.moveaxis(down, -1, 0)
+    (ux, vx), (uy, vy) = np.moveaxis(np.stack([across, down]), -1, 1)
     xx, yy, xy = ux + (ux * ux + vx * vx) / 2, vy + (uy * uy + vy * vy) / 2, (ux * uy + vx * vy + uy + vx) / 2
     return np.asarray(np.sqrt(xx * xx + yy * yy + 2 * xy * xy))
 

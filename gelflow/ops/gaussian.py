@@ -57,12 +57,14 @@ def smoother(like: Tensor, deviation: float, spacing: int = 1) -> SeparableFilte
     Beyond the border fields go on turned about their border's pixel, so that affine fields stay as they are up to the
     border; under a mean over what lies inside, the border of a rotation or an enlargement would follow the inside.
     """
-    return SeparableFilter(*(_mean(pixels, deviation, spacing, like.dtype, like.device) for pixels in like.shape[-2:]))
+    down, across = (_mean(pixels, deviation, spacing, like.dtype, like.device) for pixels in like.shape[-2:])
+    return SeparableFilter(down, across)
 
 
 def interpolator(like: Tensor, spacing: int) -> SeparableFilter:
     """From places at a spacing to each pixel of a (..., H, W), by Keys' cubic convolution, turned beyond the border."""
-    return SeparableFilter(*(_cubic(pixels, spacing, like.dtype, like.device) for pixels in like.shape[-2:]))
+    down, across = (_cubic(pixels, spacing, like.dtype, like.device) for pixels in like.shape[-2:])
+    return SeparableFilter(down, across)
 
 
 @cached
