@@ -30,7 +30,7 @@ class SeparableFilter(NamedTuple):
 
     def __call__(self, field: Features) -> Features:
         """Filters each channel of (B, C, H, W)."""
-        if self.kernel is None or field.is_cuda or field.requires_grad or field.dtype != torch.float32:
+        if self.kernel is None or field.device.type != "cpu" or field.requires_grad or field.dtype != torch.float32:
             return self.down @ field @ self.across.T
         rows, columns = len(self.down), len(self.across)
         sums = field.new_empty(*field.shape[:2], rows, columns)
