@@ -8,6 +8,7 @@ import math
 import os
 import sys
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, nullcontext
 from dataclasses import asdict
 from itertools import chain
@@ -131,8 +132,6 @@ def live(
     Frames that come while one is computed are left out. A camera that goes away is waited for. With --json each line is
     JSON. Latency and rate are those of the last 300 frames.
     """
-    from concurrent.futures import Future, ThreadPoolExecutor
-
     from gelflow.predict.live import Pace, follow
     from gelflow.predict.page import Page
     from gelflow.predict.recording import Recording
