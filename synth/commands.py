@@ -206,11 +206,12 @@ def inspect(
 
 def verify(path: Dataset, /, *, as_json: AsJson = False) -> int:
     """Derives the ground truth again by independent code; exit status 1 if the two disagree."""
+    from synth.pipeline.worker_pool import cores, main_left_out, one_thread_each
     from synth.progress import progress
     from synth.verify import verify_dataset
 
-    with progress("verify: samples") as advance:
-        report = verify_dataset(path, progress=advance)
+    with progress("verify: samples") as advance, main_left_out(), one_thread_each():
+        report = verify_dataset(path, progress=advance, workers=cores())
     if as_json:
         print(json.dumps(report.record()))
     else:

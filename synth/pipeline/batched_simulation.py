@@ -8,6 +8,7 @@ The trajectories of one sensor are handed on together: its renderer is worth as 
 for one of their sensor's are a few hundred kilobytes each.
 """
 
+import os
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -83,7 +84,7 @@ class _Simulation:
 
     def __iter__(self) -> Iterator[tuple[int, Result]]:
         if self._context.plan.solver_device == "cuda":  # on a new machine several modules compile at once
-            wp.load_module("synth.simulate", "cuda", recursive=True)
+            wp.load_module("synth.simulate", "cuda", recursive=True, max_workers=os.cpu_count() or 1)
         while self._drawn or self._draw():
             for gel in islice(self._drawn, 1):
                 presses = _OfOnePad(partial(self._next, gel))

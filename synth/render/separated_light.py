@@ -49,7 +49,7 @@ _MANY = 0.25
 """Share of a face's pilots that must see gel for its bounced light to be linear and not constant."""
 _RETURNING_PATHS = 144
 """Paths from each point at which light that comes back from the window is sampled."""
-_NEGLIGIBLE = 1e-4
+_NEGLIGIBLE = 3e-3
 """Share of all light on a point up to which a light's shadows are not sampled."""
 _NODES, _BOUNCED_NODES = 14, 6
 """Points of a light without closed form for a pixel, and for a point on which bounced light begins."""

@@ -6,8 +6,13 @@ it is checked that they are there (`flow_file_problems`); their values are not
 derived again.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -29,19 +34,30 @@ from synth.verify.sheet import Sheet
 
 _NAMED = {"scene.hash": "scene_hash", "seed": "seed", "index": "index"}
 """Keys in the header of flow.exr, and the same in meta.json."""
+_WORTHWHILE = 4
+"""Fewest samples for which another process is begun."""
 
 
-def verify_dataset(path: Path | str, progress: Callable[[int, int], None] | None = None) -> Report:
+def verify_dataset(path: Path | str, progress: Callable[[int, int], None] | None = None, *, workers: int = 1) -> Report:
     """Verifies a dataset directory; `progress` is called after each sample with how many are done and of how many.
 
-    A damaged sample is a failed check; InputError where it is no dataset.
+    At most `workers` processes share the samples. A damaged sample is a failed check; InputError where it is no
+    dataset.
     """
     dataset = read_dataset(path)
-    reports = []
-    for index in dataset.samples:
-        reports.append(_verify_files(dataset, index))
-        if progress is not None:
-            progress(len(reports), len(dataset))
+    one, reports = partial(_verify_files, dataset), []
+    processes = min(workers, len(dataset) // _WORTHWHILE)
+    with ExitStack() as stack:
+        found: Iterator[SampleReport] = map(one, dataset.samples)
+        if processes > 1:
+            ignored = (signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends this process, and this one those
+            pool = ProcessPoolExecutor(processes, get_context("spawn"), signal.signal, ignored)
+            at_once = 1 + len(dataset) // (16 * processes)
+            found = stack.enter_context(pool).map(one, dataset.samples, chunksize=at_once)
+        for report in found:
+            reports.append(report)
+            if progress is not None:
+                progress(len(reports), len(dataset))
     return Report(dataset.path, tuple(reports))
 
 

@@ -1,4 +1,4 @@
-"""The paper's table: seeds are averaged before they are compared, and a claim needs every method that it names."""
+"""The paper's table: claims are judged seed by seed, and need every method that they name."""
 
 from benchmarks.paper import _spread, _verdict
 from benchmarks.rows import Row
@@ -19,6 +19,10 @@ def test_means_over_pairs_come_before_those_over_seeds() -> None:
 
 def test_a_claim_is_judged_where_all_its_methods_have_run() -> None:
     assert _verdict(ROWS, ("GelFlow",), ("SelfFlow",)) == (
-        "real holds (+0.500 db); synthetic does not hold (+0.100 px)"
+        "real no difference (-0.50, +1.50 db); synthetic does not hold (+0.00, +0.20 px)"
     )
+    only_second = [row for row in ROWS if row["seed"] != 0]
+    assert _verdict(only_second, ("GelFlow",), ("SelfFlow",)).startswith("real holds (+1.50 db)")
+    first_alone = [*ROWS, *({**row, "method": "GelFlow+ft"} for row in ROWS if row["seed"] == 0)]
+    assert "(+0.00 db)" in _verdict(first_alone, ("GelFlow",), ("GelFlow+ft",)), "the seeds that both have"
     assert _verdict(ROWS, ("SelfFlow",), ("GelFlow", "RAFT")) == "real not run (RAFT); synthetic not run (RAFT)"

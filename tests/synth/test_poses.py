@@ -18,6 +18,8 @@ from tiny_scene import write_tiny
 from synth.cli import main
 from synth.dataset.export import export
 from synth.dataset.reader import read_dataset
+from synth.mesh import PadMesh, domed
+from synth.mesh.face import face_height
 from synth.pipeline.generate import generate
 from synth.planning import plan, predict
 from synth.press.measure import Distance
@@ -45,22 +47,32 @@ def about(axis: str, degrees: float) -> Rotation:
     return Rotation.from_euler(axis, degrees, degrees=True)
 
 
-def posed(rows: list[tuple[float, ...]], **parts: Any) -> Trajectory:
+def posed(rows: list[tuple[float, ...]], mesh: PadMesh = MESH, **parts: Any) -> Trajectory:
     drawn = scene(**parts, motion={"depth_mm": 0.0})
     content = drawn.model_dump()
     content["motion"] = {"poses": rows, "steps": len(rows) - 1}
-    return complete(type(drawn).model_validate(content), MESH)
+    return complete(type(drawn).model_validate(content), mesh)
 
 
-@pytest.mark.parametrize("indenter", [BALL, {**BOX, "rotation_deg": [10.0, 5.0, 0.0]}], ids=["ball", "tilted box"])
-def test_the_same_press_by_motion_and_by_poses_gives_the_same_states(indenter: dict[str, Any]) -> None:
+@pytest.mark.parametrize(("indenter", "dome"), [
+    (BALL, None), ({**BOX, "rotation_deg": [10.0, 5.0, 0.0]}, None), (BALL, 12.0),
+], ids=["ball", "tilted box", "ball on a dome"])  # fmt: skip
+def test_the_same_press_by_motion_and_by_poses_gives_the_same_states(
+    indenter: dict[str, Any], dome: float | None
+) -> None:
     """Press, shear with twist, and release."""
     motion: dict[str, Any] = {"depth_mm": 0.5, "shear_mm": [0.4, -0.2], "twist_deg": 8.0, "steps": 5}
     motion["position_mm"] = [0.1, 0.2]
     motion["then"] = [{"depth_mm": 0.2, "shear_mm": [0.4, -0.2], "twist_deg": 8.0}]
     # Both are solved to this share of the nodal forces, which leaves less than 1e-6 of the displacement.
-    parts = {"indenter": indenter, "friction": 0.4, "numerics": {"tolerance": 1e-11}}
-    by_motion = complete(scene(**parts, motion=motion), MESH)
+    parts = {
+        "indenter": indenter,
+        "friction": 0.4,
+        "numerics": {"tolerance": 1e-11},
+        "gel": {"shape": "dome" if dome else "box", "dome_radius_mm": dome},
+    }
+    mesh = domed(MESH, dome)
+    by_motion = complete(scene(**parts, motion=motion), mesh)
     path = path_of(scene(**parts, motion=motion))
     lengths = [0.0, *path.records().tolist()]
     body = Rotation.from_matrix(path.body.rotation)
@@ -69,12 +81,13 @@ def test_the_same_press_by_motion_and_by_poses_gives_the_same_states(indenter: d
         row(number, tuple(pose.centre), Rotation.from_matrix(pose.rotation) * body.inv())
         for number, pose in enumerate(poses)
     ]
-    by_poses = posed(rows, **parts)
+    by_poses = posed(rows, mesh, **parts)
     assert len(by_poses.states) == len(by_motion.states) == 6
+    above = face_height(np.array([motion["position_mm"]]), dome).item()  # a press's depth begins there, a pose's at 0
     for one, two in zip(by_motion.states, by_poses.states, strict=True):
         largest = np.abs(by_motion.states[-2].displacement).max()
         np.testing.assert_allclose(two.displacement, one.displacement, rtol=0, atol=1e-6 * largest)
-        assert two.depth_mm == pytest.approx(one.depth_mm, abs=1e-9)
+        assert two.depth_mm == pytest.approx(one.depth_mm + above, abs=1e-9)
         assert two.shear_mm == pytest.approx(one.shear_mm, abs=1e-9)
         assert two.twist_deg == pytest.approx(one.twist_deg, abs=1e-9)
     assert by_poses.states[3].force_n[2] > 0.1

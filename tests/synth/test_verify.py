@@ -150,7 +150,7 @@ def test_photometry_tells_the_right_flow_from_wrong_ones_or_that_it_does_not_app
     assert "textured blocks the motion bends too fast" in check.detail
 
 
-def test_dataset_on_disk(tmp_path, sample):
+def test_dataset_on_disk(tmp_path, sample, monkeypatch):
     path, seen = tmp_path / "data", []
     with DatasetWriter(path, Job(SCENE.model_dump(mode="json"), "double", "0", seed=0, n=2)) as writer:
         write(writer, as_sample(0, SCENE, sample), as_sample(1, SCENE, sample))
@@ -173,6 +173,10 @@ def test_dataset_on_disk(tmp_path, sample):
     assert "flow.exr: its header has seed = None, meta.json 0" in failed["files"]
     assert "row 70, column 90" in failed["forward flow"]
     assert not damaged.samples[1].ok
+    monkeypatch.setattr("synth.verify.dataset._WORTHWHILE", 1)
+    seen.clear()
+    assert verify_dataset(path, lambda *numbers: seen.append(numbers), workers=2).record() == damaged.record()
+    assert seen == [(1, 2), (2, 2)]
     assert "truncated" in damaged.samples[1].checks[0].detail
     refused("not a dataset", verify_dataset, tmp_path)
 
