@@ -187,13 +187,14 @@ def live(
 
 def show_live(page: Page, flow: LiveFlow, words: str, scale: float) -> float:
     """Shows a frame; returns the scale of its picture, px, which goes on from that of the picture before."""
+    from gelflow.files.image import shown
     from gelflow.models.working_size import unknown_px
     from gelflow.predict.pictures import certain, draw_markers, draw_overlay, draw_sigma, robust_scale, round_up
 
     known = certain(flow.found.flow, flow.found.sigma)
     scale = max(SCALE_DECAY * scale, robust_scale(known))
     seen = [] if flow.markers is None else [marker.item()[:-1] for marker in flow.markers if marker["visible"]]
-    picture = draw_overlay(draw_markers(flow.frame, seen), known, round_up(scale))
+    picture = draw_overlay(draw_markers(shown(flow.frame), seen), known, round_up(scale))
     page.show(picture, draw_sigma(flow.found.sigma, unknown_px(*flow.found.sigma.shape)), words, seen)
     return scale
 

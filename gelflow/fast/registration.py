@@ -124,7 +124,7 @@ def _posterior(sums: NDArray[np.float32], so_far: FlowArray) -> FlowArray:
 def fields(flow: FlowArray, first: Level, second: Level) -> tuple[ImageArray, ImageArray, ImageArray, ImageArray]:
     """Under a flow on the level's grid: residual, gradient along x and y of both images' mean, and image 2 moved."""
     height, width = first.image.shape[:2]
-    places = cv2.scaleAdd(resized(flow, (height, width)), 2 / first.pixel, _enlarged(height, width))
+    places = cv2.scaleAdd(resized(flow, (height, width)), 2 / first.pixel, 2 * indices(height, width) + 0.5)
     moved = cv2.remap(second.enlarged, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     # The mean of both images' gradients converges from further away than either alone.
     across, down = slopes(moved + first.image, 0.5 / first.pixel)
@@ -212,9 +212,3 @@ def indices(height: int, width: int) -> FlowArray:
     """Column and row of each pixel, (h, w, 2)."""
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     return np.stack([columns, rows], axis=-1)
-
-
-@functools.lru_cache(8)
-def _enlarged(height: int, width: int) -> FlowArray:
-    """Where each pixel is in an image of twice the size, (h, w, 2)."""
-    return 2 * indices(height, width) + np.float32(0.5)

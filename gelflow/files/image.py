@@ -158,10 +158,8 @@ def to_bytes(image: ImageArray) -> Bytes3:
 
 def shown(frame: Frame) -> Bytes3:
     """A frame in its `full_range`, with 8 bits."""
-    factor = range_factor(float(frame.max()) / float(np.iinfo(frame.dtype).max))
-    if frame.dtype == np.uint8 and factor == 1:
-        return cast(Bytes3, frame)
-    return to_bytes(np.float32(factor) * in_unit_range(frame))
+    image = in_unit_range(frame)
+    return to_bytes(full_range(image, image)[0])
 
 
 def to_grey(image: ImageArray) -> Grey8:

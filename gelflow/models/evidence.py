@@ -60,9 +60,8 @@ def compared(flow: Flow, first: Images, second: Sample) -> tuple[Images, Images,
 def without_mean(image: Features, counts: Tensor, deviation: float) -> Features:
     """An image less its mean in a Gaussian over the pixels that count, (B, 1, H, W)."""
     window = window_sums(image, deviation, 2)
-    mean = window(counts * image) / window(counts).clamp(min=TINY)
-    height, width = image.shape[-2:]
-    return image - F.interpolate(mean, scale_factor=2.0, mode="bilinear")[..., :height, :width]
+    mean = F.interpolate(window(counts * image) / window(counts).clamp(min=TINY), scale_factor=2.0, mode="bilinear")
+    return image - mean[..., : image.shape[-2], : image.shape[-1]]
 
 
 def slopes(image: Features) -> tuple[Features, Features]:

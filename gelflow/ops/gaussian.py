@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.linalg import toeplitz
 from torch import Tensor
 
 from gelflow.arrays import Features
@@ -70,12 +71,9 @@ def interpolator(like: Tensor, spacing: int) -> SeparableFilter:
 @cached
 def _sums(pixels: int, deviation: float, spacing: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Matrix (n / s, n) of the sums along one axis."""
-    kernel = torch.from_numpy(_kernel(deviation, spacing)).to(device)
-    cells = math.ceil(pixels / spacing)
-    reach = len(kernel) // 2
-    distance = torch.arange(cells, device=device) - torch.arange(cells, device=device).view(-1, 1)
-    weight = torch.where(distance.abs() <= reach, kernel[(distance + reach).clamp(0, 2 * reach)], 0.0)
-    return weight.repeat_interleave(spacing, dim=1)[:, :pixels].to(dtype)
+    kernel, cells = _kernel(deviation, spacing), math.ceil(pixels / spacing)
+    column = np.pad(kernel[len(kernel) // 2 :], (0, cells))[:cells]
+    return torch.from_numpy(toeplitz(column).repeat(spacing, axis=1)[:, :pixels]).to(device, dtype)
 
 
 @functools.cache

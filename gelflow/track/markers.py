@@ -40,7 +40,8 @@ class Markers:
             size = found[:, 2] / np.median(found[:, 2])
             whole = inside_by(found[:, :2], grey.shape, 0.6 * float(np.median(found[:, 2])))
             found = found[(size > SIZES[0]) & (size < SIZES[1]) & whole]
-        self._reference = _halved(reference)
+        self._half = (grey.shape[0] // 2, grey.shape[1] // 2)
+        self._reference = resized(cv2.cvtColor(reference, cv2.COLOR_RGB2GRAY), self._half)
         self._deviation = float(np.median(found[:, 2])) / 2 if len(found) else 1.0
         self._centres = np.array([blob_centre(values, *blob) for blob in found]).reshape(-1, 2)
 
@@ -71,17 +72,12 @@ class Markers:
 
     def _likeness(self, flow: FlowArray, frame: ImageArray) -> MapArray:
         """Of reference and moved frame, covariance over the mean of the variances, at half their size; at most 1."""
-        one, other = self._reference, _halved(frame)
-        places = indices(*one.shape) + resized(np.nan_to_num(flow), one.shape) / 2
+        one, other = self._reference, resized(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), self._half)
+        places = indices(*self._half) + resized(np.nan_to_num(flow), self._half) / 2
         two = cv2.remap(other, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         fields = (one, two, one * two, one * one + two * two)
         mean1, mean2, mixed, square = (cv2.GaussianBlur(field, (0, 0), self._deviation / 2) for field in fields)
         return 2 * (mixed - mean1 * mean2) / (square - mean1**2 - mean2**2).clip(1e-9)
-
-
-def _halved(image: ImageArray) -> MapArray:
-    """Luma at half the size."""
-    return resized(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (image.shape[0] // 2, image.shape[1] // 2))
 
 
 def marker_table(places: FlowArray | None) -> Sequence[str]:

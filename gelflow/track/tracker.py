@@ -30,8 +30,7 @@ from gelflow.models.weights import weights_file
 from gelflow.track.markers import Markers
 
 TRACKING = (STAGES[0], STAGES[-1]._replace(steps=1))
-"""Stages from the last flow on. The first smooths it, so that errors between marks do not add up over frames. After it,
-so little is left that a second step of the last stage changes no error by more than a hundredth."""
+"""Stages from the last flow on. The first smooths it, so that errors between marks do not add up over frames."""
 RETRY = 10
 """Frames after which they compete again for what the last ones left."""
 CLEARLY_LESS = 0.5
