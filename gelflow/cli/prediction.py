@@ -8,6 +8,7 @@ import math
 import os
 import sys
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, nullcontext
 from dataclasses import asdict
 from itertools import chain
@@ -38,8 +39,10 @@ if TYPE_CHECKING:
     from gelflow.predict.page import Page
     from gelflow.predict.prediction import Motion, Prediction
 
-SCALE_DECAY = 0.97
-"""Share of its scale that a live picture keeps at least from one frame to the next."""
+SCALE_DECAY = 0.9
+"""Share of its scale that a live picture keeps at least from one picture to the next."""
+PICTURE_S = 0.08
+"""Least time from one picture of the page to the next: drawing takes more than half as long as the flow."""
 InPlace = Annotated[str | None, Parameter(help=f"In place of the network: {METHODS}.")]
 
 
@@ -142,10 +145,12 @@ def live(
     page = None if port is None else Page(port)
     if page:
         print(f"gelflow: {estimator.name} at {page.address}", file=sys.stderr, flush=True)
-    pace, scale, started = Pace(), 0.0, time.perf_counter()
+    pace, started = Pace(), time.perf_counter()
+    drawn, drawn_at = Future[float](), -math.inf
+    drawn.set_result(0.0)
     marked = markers is not None or (page is not None and reference == "first")
     try:
-        with closing(follow(estimator, source, reference, marked, places)) as flows:
+        with ThreadPoolExecutor(1) as artist, closing(follow(estimator, source, reference, marked, places)) as flows:
             first = next(flows)  # a source that does not open replaces no files
             with (
                 nullcontext() if out is None else closing(Recording(out)) as recording,
@@ -163,8 +168,9 @@ def live(
                         table.flush()
                     line = {**asdict(motion), "latency_s": flow.latency_s, "left_out": flow.left_out}
                     words = f"frame {motion.frame}: {_words(motion)}; {pace}"
-                    if page:
-                        scale = show_live(page, flow, words, scale)
+                    if page and drawn.done() and time.perf_counter() > drawn_at + PICTURE_S:
+                        drawn_at = time.perf_counter()
+                        drawn = artist.submit(show_live, page, flow, words, drawn.result())
                     print(json.dumps(line) if as_json else words, flush=True)
                     if time.perf_counter() - started >= seconds:
                         break
@@ -180,14 +186,15 @@ def live(
 
 
 def show_live(page: Page, flow: LiveFlow, words: str, scale: float) -> float:
-    """Shows a frame; returns the scale of its picture, px, which goes on from that of the frame before."""
+    """Shows a frame; returns the scale of its picture, px, which goes on from that of the picture before."""
+    from gelflow.files.image import shown
     from gelflow.models.working_size import unknown_px
     from gelflow.predict.pictures import certain, draw_markers, draw_overlay, draw_sigma, robust_scale, round_up
 
     known = certain(flow.found.flow, flow.found.sigma)
     scale = max(SCALE_DECAY * scale, robust_scale(known))
     seen = [] if flow.markers is None else [marker.item()[:-1] for marker in flow.markers if marker["visible"]]
-    picture = draw_overlay(draw_markers(flow.frame, seen), known, round_up(scale))
+    picture = draw_overlay(draw_markers(shown(flow.frame), seen), known, round_up(scale))
     page.show(picture, draw_sigma(flow.found.sigma, unknown_px(*flow.found.sigma.shape)), words, seen)
     return scale
 

@@ -52,7 +52,7 @@ class RegistrationConfig(_Frozen):
     """Standard deviation that the residual has at least in each colour, of a white of 1: the camera's noise, and what
     shading changes. The larger, the more texture a window needs before it outweighs the network."""
     propagation_px: Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(max_length=16)] = (4, 8, 16, 32)
-    """Distances of the neighbours whose flow is tried before each stage, under its window; none: no such step."""
+    """Distances of neighbours whose flow is tried before first and last stage, under its window; none: no such step."""
     after: RegistrationConfig | None = None
     """Registration that comes before the stages. Its flow stays where it leaves a residual below its `noise`. Setting
     one of its fields switches it on."""

@@ -148,9 +148,9 @@ def _parts(
 def _strain(flow: FlowArray) -> MapArray:
     """The norm of Green's strain (F^T F - 1) / 2 of a flow on cells, F = 1 + grad V; (h, w)."""
     down, across = np.gradient(flow, CELL, axis=(0, 1))
-    gradient = np.stack([across, down], axis=-1) + np.eye(2, dtype=np.float32)
-    square = np.swapaxes(gradient, -1, -2) @ gradient
-    return np.asarray(np.linalg.norm(square - np.eye(2), axis=(-2, -1)) / 2, np.float32)
+    (ux, vx), (uy, vy) = np.moveaxis(np.stack([across, down]), -1, 1)
+    xx, yy, xy = ux + (ux * ux + vx * vx) / 2, vy + (uy * uy + vy * vy) / 2, (ux * uy + vx * vy + uy + vx) / 2
+    return np.asarray(np.sqrt(xx * xx + yy * yy + 2 * xy * xy))
 
 
 def _tensor(field: NDArray[np.float32]) -> Tensor:

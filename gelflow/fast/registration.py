@@ -38,6 +38,7 @@ class Stage(NamedTuple):
     pixel: int
     window_px: float
     smoothing_px: float
+    steps: int = CONFIG.iterations
 
 
 STAGES = tuple(
@@ -97,11 +98,11 @@ class Prepared:
 
 def register(flow: FlowArray, first: Prepared, second: Prepared, stages: Sequence[Stage] = STAGES) -> FlowArray:
     """Corrects a flow, px, whose grid may be any part of the image's; on the grid of the last stage."""
-    for pixel, window_px, smoothing_px in stages:
+    for pixel, window_px, smoothing_px, steps in stages:
         one, two = first.levels[pixel], second.levels[pixel]
         spacing = 2 * pixel
         flow = start = smoothed(resized(flow, one.grid), smoothing_px / spacing)
-        for _ in range(CONFIG.iterations):
+        for _ in range(steps):
             residual, across, down, _ = fields(flow, one, two)
             pairs = [(across, across), (across, down), (down, down), (across, residual), (down, residual)]
             counted = inside(flow, one)
@@ -123,7 +124,7 @@ def _posterior(sums: NDArray[np.float32], so_far: FlowArray) -> FlowArray:
 def fields(flow: FlowArray, first: Level, second: Level) -> tuple[ImageArray, ImageArray, ImageArray, ImageArray]:
     """Under a flow on the level's grid: residual, gradient along x and y of both images' mean, and image 2 moved."""
     height, width = first.image.shape[:2]
-    places = resized(flow, (height, width)) * (2 / first.pixel) + (2 * indices(height, width) + 0.5)
+    places = cv2.scaleAdd(resized(flow, (height, width)), 2 / first.pixel, 2 * indices(height, width) + 0.5)
     moved = cv2.remap(second.enlarged, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     # The mean of both images' gradients converges from further away than either alone.
     across, down = slopes(moved + first.image, 0.5 / first.pixel)
@@ -145,9 +146,8 @@ def products(pairs: Sequence[tuple[ImageArray, ImageArray]], grid: tuple[int, in
 def inside(flow: FlowArray, level: Level) -> MapArray:
     """1 where the flow, on the level's grid, stays in the image, else 0; (h, w)."""
     height, width = flow.shape[:2]
-    half = np.array([width, height], np.float32) * level.pixel
-    inside = np.abs((indices(height, width) + 0.5) * (2 * level.pixel) - half + flow) <= half
-    return (inside[..., 0] & inside[..., 1]).astype(np.float32)
+    places = cv2.scaleAdd(flow, 0.5 / level.pixel, indices(height, width))
+    return cv2.inRange(places, (-0.5, -0.5), (width - 0.5, height - 0.5)).astype(np.float32) / 255
 
 
 def unexplained(flow: FlowArray, first: Prepared, second: Prepared, window_px: float) -> tuple[MapArray, MapArray]:

@@ -156,6 +156,12 @@ def to_bytes(image: ImageArray) -> Bytes3:
     return np.clip(np.rint(image * 255.0), 0, 255).astype(np.uint8)
 
 
+def shown(frame: Frame) -> Bytes3:
+    """A frame in its `full_range`, with 8 bits."""
+    image = in_unit_range(frame)
+    return to_bytes(full_range(image, image)[0])
+
+
 def to_grey(image: ImageArray) -> Grey8:
     """Luma of an image as (H, W) uint8: round(.299 R + .587 G + .114 B) of its 8-bit channels (ITU-R BT.601)."""
     return cv2.cvtColor(to_bytes(image), cv2.COLOR_RGB2GRAY)

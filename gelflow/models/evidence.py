@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gelflow.arrays import Features, Flow, Images
-from gelflow.ops.gaussian import SeparableFilter, interpolator, window_sums
+from gelflow.ops.gaussian import SeparableFilter, window_sums
 from gelflow.ops.warp import inside_at, positions
 
 TINY = 1e-6
@@ -59,8 +59,9 @@ def compared(flow: Flow, first: Images, second: Sample) -> tuple[Images, Images,
 
 def without_mean(image: Features, counts: Tensor, deviation: float) -> Features:
     """An image less its mean in a Gaussian over the pixels that count, (B, 1, H, W)."""
-    window, to_pixels = window_sums(image, deviation, 2), interpolator(image, 2)
-    return image - to_pixels(window(counts * image) / window(counts).clamp(min=TINY))
+    window = window_sums(image, deviation, 2)
+    mean = F.interpolate(window(counts * image) / window(counts).clamp(min=TINY), scale_factor=2.0, mode="bilinear")
+    return image - mean[..., : image.shape[-2], : image.shape[-1]]
 
 
 def slopes(image: Features) -> tuple[Features, Features]:

@@ -12,12 +12,12 @@ residual is taken without its mean over a neighbourhood of that width, so that s
 gel, does not count. Without, and with a wide ``p``, the images' difference is what is minimised, whatever it comes
 from: a high PSNR, and a flow that follows shading.
 
-Gauss-Newton steps stay in the basin that they start in. With `propagation_px` each stage therefore tries neighbours'
-flows first (`gelflow.models.propagation`); where a whole neighbourhood mistook dots for the next ones, that does not
-help. With `after`, another registration comes before all stages. Its flow stays wherever the residual that it leaves is
-below its `noise`. So registration for both keeps the motion where motion explains the images, and follows brightness
-elsewhere. Where shading is ignored, each pixel finally takes the window that fits it (`gelflow.models.wider_window`):
-the last stage's, a wider one, or where the flow bends, that of a further stage.
+Gauss-Newton steps stay in the basin that they start in. With `propagation_px` the first and the last stage therefore
+try neighbours' flows first (`gelflow.models.propagation`); where a whole neighbourhood mistook dots for the next ones,
+that does not help. With `after`, another registration comes before all stages. Its flow stays wherever the residual
+that it leaves is below its `noise`. So registration for both keeps the motion where motion explains the images, and
+follows brightness elsewhere. Where shading is ignored, each pixel finally takes the window that fits it
+(`gelflow.models.wider_window`): the last stage's, a wider one, or where the flow bends, that of a further stage.
 
 Lucas and Kanade 1981, with a prior (Simoncelli, Adelson and Heeger, "Probability distributions of optical flow", 1991);
 smoothing the field between the steps: Thirion's demons, 1998.
@@ -56,7 +56,7 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
         if config.after is not None:
             former = flow = registered(flow, first, image2, config.after)
         for window_px, smoothing_px in zip(config.windows_px, config.smoothing_px, strict=True):
-            if config.propagation_px:
+            if config.propagation_px and window_px in (config.windows_px[0], config.windows_px[-1]):
                 flow = propagated(flow, first, image2, window_px, config)
             if window_px >= HALF_SIZE_PX:
                 found = 2 * _stage(halve(flow) / 2, half1, half2, window_px / 2, smoothing_px / 2, coarse)

@@ -112,7 +112,7 @@ def second_moment(window: SeparableFilter, field: Features) -> Features:
     spacing = math.ceil(field.shape[-2] / len(window.down))
     x, y = pixel_indices(field)
     squares = (((spacing - 1) / 2 + p[::spacing].view(-1, 1) - p).square() for p in (y[:, 0], x[0]))
-    down, across = (matrix * square for matrix, square in zip(window, squares, strict=True))
+    down, across = (matrix * square for matrix, square in zip(window[:2], squares, strict=True))
     return SeparableFilter(down, window.across)(field) + SeparableFilter(window.down, across)(field)
 
 

@@ -14,6 +14,7 @@ whose steps do need the images, is better than V.
 """
 
 import functools
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -45,12 +46,12 @@ def best_window(flow: Flow, variance: Tensor, texture: Tensor, window_px: float,
     least, error = torch.ones_like(variance), variance
     best = flow
     for width in WIDTHS_PX:
-        window = window_sums(flow, width / pixel)
-        wide = _mean(flow, weight, window)
-        wide = wide + _mean(flow - wide, weight, window)
+        mean = _mean(weight, window_sums(flow, width / pixel))
+        wide = mean(flow)
+        wide = wide + mean(flow - wide)
         shared, left = _noise_shares(window_px, width)
         apart = (wide - flow).square().sum(dim=1, keepdim=True)
-        risk = _mean(apart / variance, weight, window) + 2 * shared - 1
+        risk = mean(apart / variance) + 2 * shared - 1
         better = risk < least
         best, least = torch.where(better, wide, best), torch.where(better, risk, least)
         error = torch.where(better, variance * risk.clamp(min=left), error)
@@ -67,9 +68,9 @@ def bends(
     known at every `pixel`-th px along each axis.
     """
     apart = (fine - flow).square().sum(dim=1, keepdim=True)
-    window, alike = window_sums(flow, BEND_WINDOW_PX / pixel), torch.ones_like(apart)
-    risk = _mean(apart / variance.clamp(min=MIN_VARIANCE), alike, window) + 2 * fine_noise(*windows_px)[0] - 1
-    return (risk >= 1) & (_mean(apart, alike, window) <= reach_px**2)
+    mean = _mean(torch.ones_like(apart), window_sums(flow, BEND_WINDOW_PX / pixel))
+    risk = mean(apart / variance.clamp(min=MIN_VARIANCE)) + 2 * fine_noise(*windows_px)[0] - 1
+    return (risk >= 1) & (mean(apart) <= reach_px**2)
 
 
 @functools.cache
@@ -87,9 +88,10 @@ def fine_noise(window_px: float, fine_px: float) -> tuple[float, float]:
     return float((k * before * after).sum() / total), float(total / (k * fine**2).sum())
 
 
-def _mean(field: Features, weight: Tensor, window: SeparableFilter) -> Features:
-    """The weighted mean of each channel under a window."""
-    return window(weight * field) / window(weight)
+def _mean(weight: Tensor, window: SeparableFilter) -> Callable[[Features], Features]:
+    """Gives the weighted mean of each channel under a window."""
+    total = window(weight)
+    return lambda field: window(weight * field) / total
 
 
 @functools.cache

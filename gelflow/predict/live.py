@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.arrays import Bytes3, Estimate, FlowArray
+from gelflow.arrays import Estimate, FlowArray, Frame
 from gelflow.errors import InputError
-from gelflow.files.image import full_range, in_unit_range, to_bytes
 from gelflow.files.video import newest_frames
 from gelflow.methods.method import Method
 from gelflow.predict.prediction import Motion, motion_of
@@ -28,7 +27,7 @@ class LiveFlow(NamedTuple):
     came while the last one was computed.
     """
 
-    frame: Bytes3
+    frame: Frame
     found: Estimate
     motion: Motion
     markers: NDArray[Any] | None
@@ -61,9 +60,8 @@ def follow(
         ):
             latency_s = time.monotonic() - arrivals[-1][1]
             left_out = index - arrivals[0][0] - 1
-            image = in_unit_range(frame)
             motion = motion_of(found, index, source, time_s, seconds)
-            yield LiveFlow(to_bytes(full_range(image, image)[0]), found, motion, moved, latency_s, left_out)
+            yield LiveFlow(frame, found, motion, moved, latency_s, left_out)
     if len(arrivals) < 2:
         raise InputError(f"{source}: fewer than two frames came; does another program use the camera?")
 

@@ -19,7 +19,7 @@ from gelflow.data.record import PairRecord
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, write_csv
 from gelflow.files.exr import DIRECTIONS, read_flow, write_flo, write_flow
-from gelflow.files.image import full_range, in_unit_range, to_bytes
+from gelflow.files.image import shown
 from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
 from gelflow.methods.method import Method, estimated
@@ -222,8 +222,7 @@ def write_overlay(
             if index > 0:
                 field = read_flow(flow_file(out, index))
                 flow = certain(field.flow, field.sigma)
-            image = in_unit_range(frame)
-            picture = draw_overlay(to_bytes(full_range(image, image)[0]), flow, scale_px)
+            picture = draw_overlay(shown(frame), flow, scale_px)
             if writer is None:
                 size = (picture.shape[1], picture.shape[0])
                 with quiet():

@@ -14,8 +14,9 @@ from tempfile import TemporaryFile
 import cv2
 import numpy as np
 
-from gelflow.arrays import Bytes3, Estimate, Frame
+from gelflow.arrays import Estimate, Frame
 from gelflow.files.exr import write_flow
+from gelflow.files.image import shown
 from gelflow.files.video import NOMINAL_RATE
 from gelflow.predict.pictures import certain, robust_scale
 from gelflow.predict.prediction import MOTION_COLUMNS, MOTIONS, Motion, earlier_files, flow_file, write_overlay
@@ -41,7 +42,7 @@ class Recording:
         self._scale_px = 0.0
         self._writer, self._pending = ThreadPoolExecutor(1), list[Future[None]]()
 
-    def add(self, frame: Bytes3, found: Estimate, motion: Motion) -> None:
+    def add(self, frame: Frame, found: Estimate, motion: Motion) -> None:
         """Writes a frame, the flow to it, and its motion."""
         self._pending.append(self._writer.submit(self._write, frame, found, motion))
         while len(self._pending) > MOST_PENDING:
@@ -58,11 +59,11 @@ class Recording:
                 rate = float(1 / np.median(np.diff(times))) if len(times) > 1 else NOMINAL_RATE
                 write_overlay(self._out, self._shown(), times, rate, self._scale_px)
 
-    def _write(self, frame: Bytes3, found: Estimate, motion: Motion) -> None:
+    def _write(self, frame: Frame, found: Estimate, motion: Motion) -> None:
         write_flow(flow_file(self._out, motion.frame), found.flow, found.visible, found.sigma)
         csv.writer(self._table).writerow(astuple(motion))
         self._table.flush()
-        _, jpeg = cv2.imencode(".jpg", frame[..., ::-1])
+        _, jpeg = cv2.imencode(".jpg", shown(frame)[..., ::-1])
         self._kept.append((motion.frame, motion.time_s or 0.0, self._frames.write(jpeg)))
         self._scale_px = max(self._scale_px, robust_scale(certain(found.flow, found.sigma)))
 

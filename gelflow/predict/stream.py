@@ -45,7 +45,7 @@ class Stream:
         if frame.shape != self._before.shape:
             raise InputError("has another size than the frame before it")
         if self._tracker is not None:
-            tracked = self._tracker.update(in_unit_range(frame))
+            tracked = self._tracker.update(frame)
             found = Estimate(tracked.flow, tracked.sigma, tracked.visible)
             return Followed(found, tracked.seconds, tracked.markers if self._with_markers else None)
         images = full_range(in_unit_range(self._before), in_unit_range(frame))

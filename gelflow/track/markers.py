@@ -40,7 +40,8 @@ class Markers:
             size = found[:, 2] / np.median(found[:, 2])
             whole = inside_by(found[:, :2], grey.shape, 0.6 * float(np.median(found[:, 2])))
             found = found[(size > SIZES[0]) & (size < SIZES[1]) & whole]
-        self._reference = cv2.cvtColor(reference, cv2.COLOR_RGB2GRAY)
+        self._half = (grey.shape[0] // 2, grey.shape[1] // 2)
+        self._reference = resized(cv2.cvtColor(reference, cv2.COLOR_RGB2GRAY), self._half)
         self._deviation = float(np.median(found[:, 2])) / 2 if len(found) else 1.0
         self._centres = np.array([blob_centre(values, *blob) for blob in found]).reshape(-1, 2)
 
@@ -61,9 +62,7 @@ class Markers:
         markers["x"], markers["y"] = (self._centres + 0.5).T
         markers["u"], markers["v"] = read(found.flow).T
         markers["sigma"] = read(found.sigma)
-        places, grey = indices(*found.sigma.shape) + np.nan_to_num(found.flow), cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
-        moved = cv2.remap(grey, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        likeness = resized(_likeness(self._reference, moved, self._deviation), grey.shape)
+        likeness = resized(self._likeness(found.flow, frame), found.sigma.shape)
         known = markers["sigma"] < unknown_px(*found.sigma.shape)
         markers["visible"] = known & (read(found.visible) > 0.5) & (read(likeness) > MIN_LIKENESS)
         ends = np.nan_to_num(np.stack([markers["x"] + markers["u"], markers["y"] + markers["v"]], axis=-1))
@@ -71,14 +70,14 @@ class Markers:
             markers["visible"][max(pair, key=lambda one: markers["sigma"][one])] = False
         return markers
 
-
-def _likeness(image1: MapArray, image2: MapArray, deviation: float) -> MapArray:
-    """Covariance of grey images under a Gaussian over the mean of their variances, at half their size; at most 1."""
-    half = (image1.shape[0] // 2, image1.shape[1] // 2)
-    one, two = resized(image1, half), resized(image2, half)
-    sums = [cv2.GaussianBlur(field, (0, 0), deviation / 2) for field in (one, two, one * two, one * one + two * two)]
-    mean1, mean2, mixed, square = sums
-    return 2 * (mixed - mean1 * mean2) / (square - mean1**2 - mean2**2).clip(1e-9)
+    def _likeness(self, flow: FlowArray, frame: ImageArray) -> MapArray:
+        """Of reference and moved frame, covariance over the mean of the variances, at half their size; at most 1."""
+        one, other = self._reference, resized(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), self._half)
+        places = indices(*self._half) + resized(np.nan_to_num(flow), self._half) / 2
+        two = cv2.remap(other, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        fields = (one, two, one * two, one * one + two * two)
+        mean1, mean2, mixed, square = (cv2.GaussianBlur(field, (0, 0), self._deviation / 2) for field in fields)
+        return 2 * (mixed - mean1 * mean2) / (square - mean1**2 - mean2**2).clip(1e-9)
 
 
 def marker_table(places: FlowArray | None) -> Sequence[str]:

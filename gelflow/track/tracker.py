@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.arrays import Bytes3, FlowArray, ImageArray, MapArray
+from gelflow.arrays import FlowArray, Frame, ImageArray, MapArray
 from gelflow.errors import InputError
 from gelflow.fast.certainty import Refined, refined
 from gelflow.fast.registration import STAGES, Prepared, indices, register, resized
@@ -29,7 +29,7 @@ from gelflow.models.uncertainty import MAX_SIGMA_PX
 from gelflow.models.weights import weights_file
 from gelflow.track.markers import Markers
 
-TRACKING = (STAGES[0], STAGES[-1])
+TRACKING = (STAGES[0], STAGES[-1]._replace(steps=1))
 """Stages from the last flow on. The first smooths it, so that errors between marks do not add up over frames."""
 RETRY = 10
 """Frames after which they compete again for what the last ones left."""
@@ -75,14 +75,14 @@ class Tracker:
         (64, 80, 2)
     """
 
-    def __init__(self, reference: ImageArray | Bytes3, weights: str | Path = FAST, scene: None = None) -> None:
+    def __init__(self, reference: ImageArray | Frame, weights: str | Path = FAST, scene: None = None) -> None:
         if scene is not None:
             raise InputError(f"scene = {scene!r}: millimetres are not known here; give None, and take px")
         method = open_network(weights_file(Path(weights)))
         self._network = None if isinstance(method, Fast) else method.flow
         self.reset(reference)
 
-    def reset(self, reference: ImageArray | Bytes3 | None = None) -> None:
+    def reset(self, reference: ImageArray | Frame | None = None) -> None:
         """Forgets the stream; a reference, of any size, replaces the former one and its markers."""
         if reference is not None:
             image = as_image("the reference", reference)
@@ -94,7 +94,7 @@ class Tracker:
         self._since, self._accepted = 0, 0.0
         self._time_s = -math.inf
 
-    def update(self, frame: ImageArray | Bytes3, time_s: float | None = None) -> Tracked:
+    def update(self, frame: ImageArray | Frame, time_s: float | None = None) -> Tracked:
         """Finds the flow from the reference to the next frame.
 
         Args:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from textures import as_bytes, moved, table, write_video
 
 from gelflow.baselines import named_methods
-from gelflow.cli import main
+from gelflow.cli import main, prediction
 from gelflow.cli.prediction import show_live
 from gelflow.errors import InputError
 from gelflow.files import video as video_files
@@ -335,3 +335,21 @@ def test_the_command_prints_a_line_for_each_frame_and_stops_in_time(tmp_path: Pa
     assert "Farnebäck at http://127.0.0.1:" in said.err
     assert main(["live", path, "--method", "farneback", "--seconds", "0"]) == 0
     assert [line[:5] for line in capsys.readouterr().out.splitlines()] == ["frame"]
+
+
+def test_no_frame_waits_for_the_page_to_be_drawn(tmp_path: Path, monkeypatch) -> None:
+    said, finished, waited = [], threading.Event(), []
+
+    def slow(_page: Page, _flow: LiveFlow, words: str, _scale: float) -> float:
+        waited.append(finished.wait(60))
+        return 1.0
+
+    def counted(*words: object, **_: object) -> None:
+        said.append(words)
+        if len(said) == 3:  # the page's address, and two frames
+            finished.set()
+
+    monkeypatch.setattr(prediction, "show_live", slow)
+    monkeypatch.setattr(prediction, "print", counted, raising=False)
+    assert main(["live", str(video(tmp_path / "a.avi", 10.0)), "--method", "dis-fast", "--port", "0"]) == 0
+    assert all(waited)

@@ -109,6 +109,22 @@ def test_window_sums_are_a_convolution_and_smoothing_a_gaussian_up_to_the_border
     torch.testing.assert_close(found[..., 20:-20], math.exp(-0.32) * wave[..., 20:-20], rtol=0, atol=5e-3)
 
 
+@pytest.mark.parametrize("spacing", [1, 2, 3])
+def test_window_sums_without_gradient_are_those_with_it_at_places_of_any_spacing(spacing: int) -> None:
+    field = torch.rand(2, 3, 41, 34, generator=torch.Generator().manual_seed(0))
+    window = window_sums(field, 4.0, spacing)
+    # Sums of 10 to 100 in float32, in another order.
+    torch.testing.assert_close(window(field), window(field.requires_grad_()).detach(), rtol=1e-5, atol=0)
+    x = torch.arange(120.0, dtype=torch.float64)
+    wave = torch.cos(0.3 * x).expand(1, 1, 120, -1)
+    place = x[::spacing] + (spacing - 1) / 2
+    # 2 pi s² exp(-s² k² / 2); each window's end at three deviations leaves out 0.3 % of 2 pi s².
+    expected = 2 * math.pi * 16 * math.exp(-0.72) * torch.cos(0.3 * place)
+    inner = slice(30 // spacing, 90 // spacing)
+    found = window_sums(wave, 4.0, spacing)(wave)[0, 0, 60 // spacing, inner]
+    torch.testing.assert_close(found, expected[inner], rtol=0, atol=2 * 0.003 * 2 * math.pi * 16)
+
+
 def test_between_places_at_a_spacing_fields_are_interpolated_and_near_reads_the_splines_values() -> None:
     y, x = torch.meshgrid(torch.arange(40.0).double(), torch.arange(60.0).double(), indexing="ij")
     for spacing in (1, 2, 4):
