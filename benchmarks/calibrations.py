@@ -21,16 +21,18 @@ import tomli_w
 from scipy.optimize import linear_sum_assignment
 
 from benchmarks.rows import Row, arguments, machine, measure, show
-from synth.arrays import FloatArray
+from synth.arrays import FloatArray, Points
 from synth.calibrate.irradiance import LightGeometry, LitGel
-from synth.calibrate.pressed_ball import press_ball
 from synth.cli import main as synth
+from synth.press.press import MeshRule
 from synth.render.camera_image import camera_image
-from synth.render.pattern import albedo
+from synth.render.pattern import albedo, pixels_per_mm
 from synth.render.renderer import Renderer
 from synth.render.variant import choose_variant
 from synth.scene import Render, Scene, Sensor
 from synth.scene.validation import validated
+from synth.simulate import simulate
+from synth.surface import GelSurface
 
 AZIMUTH_DEG, ELEVATION_DEG, POWER = 5.0, 10.0, 0.1
 """Errors within which a sensor counts as found; of the power, relative."""
@@ -118,14 +120,32 @@ def photographs(content: dict[str, Any], rng: np.random.Generator, out: Path) ->
     presses = [
         press_ball(sensor, RADIUS_MM, float(depth), place, 0.5) for depth, place in zip(depths, places, strict=True)
     ]
-    texture, still = albedo(sensor, rng), presses[0].surface
-    faces = [(still, still.material)] * 3 + [(press.surface, press.positions) for press in presses]
+    texture, still = albedo(sensor, rng), presses[0][0]
+    faces = [(still, still.material)] * 3 + presses
     files = []
     for number, (surface, positions) in enumerate(faces):
         radiance = Renderer(sensor, render, surface, texture, choose_variant("auto")).radiance(positions, number)
         files.append(out / f"{number}.png")
         cv2.imwrite(str(files[-1]), camera_image(radiance, sensor.camera, rng)[:, :, ::-1])
     return files[:3], files[3:]
+
+
+def press_ball(
+    sensor: Sensor, radius_mm: float, depth_mm: float, place_mm: FloatArray, friction: float
+) -> tuple[GelSurface, Points]:
+    """The face and its vertices (v, 3) mm under a ball, simulated at its own place (2,) mm."""
+    content = {
+        "name": "ball",
+        "sensor": sensor.model_dump(),
+        "contact": {"indenter": {"shape": "sphere", "radius_mm": radius_mm}, "friction": friction},
+        "motion": {"depth_mm": depth_mm, "position_mm": place_mm.tolist(), "steps": 1},
+        "numerics": {"target_error_px": 0.004 * pixels_per_mm(sensor)},
+    }
+    scene = validated(content, "a pressed ball", Scene)
+    trajectory = simulate(scene, MeshRule.of(scene).resolution(scene).mesh)
+    assert trajectory.status == "complete", trajectory.reason
+    surface = GelSurface(trajectory.space.surface, 3)
+    return surface, surface.positions(trajectory.states[-1].displacement[trajectory.space.surface_nodes])
 
 
 def calibrated(out: Path, case: Row) -> Row:

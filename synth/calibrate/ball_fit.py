@@ -12,7 +12,7 @@ from synth.calibrate.contact import Contact, change, find_contact, flanks
 from synth.calibrate.irradiance import LightGeometry, LitGel, PressChange
 from synth.calibrate.layouts import chosen
 from synth.calibrate.lights import LightFit, PressAt, Room, Target, fit_lights
-from synth.calibrate.pressed_ball import BallSeries, PressedBall, press_ball, press_series
+from synth.calibrate.pressed_ball import BallSeries, press_series
 from synth.errors import InputError
 from synth.optics import Optics
 from synth.render.camera_image import off_centre
@@ -64,11 +64,6 @@ class Press:
     rest: FloatArray
     changed: FloatArray
     pose: FloatArray
-
-    def ball(self, sensor: Sensor, balls: Balls, series: BallSeries) -> PressedBall:
-        """The gel's face under the ball at its place and depth, at most that of the series that it was found by."""
-        depth = min(float(np.exp(self.pose[2])), float(series.contacts[-1, 0]))
-        return press_ball(sensor, balls.radius_mm, depth, self.pose[:2], balls.friction)
 
     def azimuth_and_rise(self, changed: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Those of `synth.calibrate.contact.flanks`, of a change (n, 3) at the pixels."""

@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 from matplotlib.figure import Figure
 
-from synth.arrays import BoolArray, FloatArray
+from synth.arrays import BoolArray, FloatArray, Points
 from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import PLACE
-from synth.calibrate.pressed_ball import PressedBall
 from synth.errors import InputError
 from synth.mesh import rest_surface
 from synth.render.camera_image import encoded, expected_signal
@@ -20,6 +19,7 @@ from synth.render.pattern import albedo, pixels_per_mm
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant
 from synth.scene import Dots, Render, Sensor
+from synth.surface import GelSurface
 
 AMPLIFIED = 8
 """Factor of the differences in the picture."""
@@ -65,9 +65,11 @@ def render_gel(
     render: Render,
     variant: Variant,
     measured: LightModel | None = None,
-    pressed: PressedBall | None = None,
+    pressed: tuple[GelSurface, Points] | None = None,
 ) -> FloatArray:
     """The gel's picture (H, W, 3) at rest or pressed, encoded, in [0, 1], without noise and quantisation.
+
+    A pressed face is a surface and its vertices (v, 3) mm.
 
     Dots are drawn on their grid without jitter, which no frame tells for another gel.
     """
@@ -75,9 +77,8 @@ def render_gel(
     if isinstance(sensor.pattern, Dots):
         even = sensor.pattern.model_copy(update={"jitter_mm": 0.0, "radius_jitter": 0.0})
         plain = sensor.model_copy(update={"pattern": even})
-    surface = rest_surface(sensor.gel) if pressed is None else pressed.surface
+    surface, positions = pressed or (rest := rest_surface(sensor.gel), rest.material)
     renderer = Renderer(sensor, render, surface, albedo(plain, np.random.default_rng(0)), variant, measured)
-    positions = surface.material if pressed is None else pressed.positions
     return encoded(expected_signal(renderer.radiance(positions, 0), sensor.camera), sensor.camera)
 
 
@@ -111,7 +112,7 @@ def picture(rows: dict[str, Comparison], title: str) -> bytes:
             axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
             axis.set_title(caption, fontsize=9)
             axis.set_axis_off()
-    figure.suptitle(title, fontsize=10)
+    figure.suptitle(title, fontsize=10, y=1 - 0.1 / figure.get_figheight())
     figure.tight_layout()
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")

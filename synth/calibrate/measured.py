@@ -33,8 +33,8 @@ FILE, FLAT = "measured_light.yaml", "measured_light.png"
 _DEGREE, _PRIOR, _STEPS, _MOVE = 2, 0.01, 2, 0.05
 """Degree in the place; weight of the coefficients' prior, as of encoded values of pixels; steps of places and depths,
 and by how much these are moved to see what it changes."""
-_HEIGHTS, _SIZES = (0.15, 0.25, 0.35, 0.45, 0.6, 0.8), (1.0, 0.3)
-"""Heights over the body's, and shares of their sizes, at which lights that throw shadows are sought."""
+_PLACES = (0.0, -12.0, 12.0), (0.15, 0.25, 0.35, 0.45, 0.6, 0.8), (1.0, 0.3, 0.05)
+"""Turns (degrees), heights over the body's and shares of their sizes, at which lights that throw shadows are sought."""
 _SHIFTS = ((0.0, -0.6, -0.45, -0.3, -0.15, 0.15, 0.3), *3 * ((0.0, -0.1, 0.1),))
 """What is added to the logarithm of all depths, in rounds: shadows widen the circles that tell depths."""
 _MOVES = (0.0, -6.0, 6.0), (1.0, 0.8, 1.25), (1.0, 0.8, 1.25)
@@ -64,7 +64,7 @@ def fit_measured(
         return weight[..., None] * _basis(gel.points[:, :2] / side.min(), gel.normals)
 
     leads, body = _leads(fit, variant), sensor.gel.size_mm[2] + sensor.window.thickness_mm
-    tried = leads + [_moved(lead, sensor, 0, 1, share * body, size) for share, size in product(_HEIGHTS, _SIZES)
+    tried = leads + [_moved(lead, sensor, turn, 1, share * body, size) for turn, share, size in product(*_PLACES)
                      for lead in leads]  # fmt: skip
     for shifts in _SHIFTS:
         found = []

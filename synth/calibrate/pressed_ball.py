@@ -1,6 +1,6 @@
 """The gel's face under a ball, by the product's own simulation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,6 @@ from synth.render.pattern import pixels_per_mm
 from synth.scene import Scene, Sensor
 from synth.scene.validation import validated
 from synth.simulate import simulate
-from synth.simulate.trajectory import Trajectory
 from synth.surface import GelSurface
 
 _TOUCHING_MM = 0.02
@@ -28,15 +27,8 @@ _FINE_MM = 0.004
 """Error of the face that the mesh is made for: a tenth of that moves a flank's slope by some per cent."""
 _DEEPEST = 0.8
 """Share of the gel's thickness that a ball of a series is pressed in at most."""
-
-
-@dataclass(frozen=True, eq=False)
-class PressedBall:
-    """The face's vertices (v, 3) mm under a ball that is pressed in straight, and the contact's radius."""
-
-    surface: GelSurface
-    positions: Points
-    contact_mm: float
+_MOVED = 0.9
+"""Share of the distance from a press to the gel's edge within which the face is moved as one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,51 +46,48 @@ class BallSeries:
 
     def face(self, pose: FloatArray) -> Points:
         """Vertices (v, 3) mm under a press with the pose (3,): its place, mm, and the logarithm of its depth in mm."""
-        depth = np.clip(np.exp(pose[2]), 0, self.contacts[-1, 0])
-        return self.surface.positions(self.displacement(depth)) + np.append(pose[:2], 0.0)
+        return self.surface.positions(self._moved(pose)) + np.append(pose[:2], 0.0)
+
+    def pressed(self, pose: FloatArray) -> tuple[GelSurface, Points]:
+        """The same as a surface and its vertices, with edges and pattern where the gel's are."""
+        nodes = self.surface.coarse.nodes.copy()
+        for axis, place in enumerate(pose[:2]):
+            half = np.abs(nodes[:, axis]).max()
+            near = _MOVED * max(half - abs(place), 0)
+            ends = [-half, place - near, place + near, half]
+            nodes[:, axis] = np.interp(nodes[:, axis], [-half, -near, near, half], ends)
+        surface = GelSurface(replace(self.surface.coarse, nodes=nodes), _PARTS)
+        return surface, surface.positions(self._moved(pose))
+
+    def _moved(self, pose: FloatArray) -> FloatArray:
+        return np.asarray(self.displacement(min(float(np.exp(pose[2])), self.contacts[-1, 0])))
 
     def depth_mm(self, contact_mm: float) -> float:
         """The depth at which a contact has this radius, at most the deepest."""
         return float(np.interp(contact_mm, np.maximum.accumulate(self.contacts[:, 1]), self.contacts[:, 0]))
 
 
-def press_ball(sensor: Sensor, radius_mm: float, depth_mm: float, place_mm: FloatArray, friction: float) -> PressedBall:
-    """Simulate one press; InputError where the ball does not fit the gel, or the press does not complete."""
-    trajectory = _simulated(sensor, radius_mm, depth_mm, place_mm, friction, 1)
-    space = trajectory.space
-    surface = GelSurface(space.surface, _PARTS)
-    positions = surface.positions(trajectory.states[-1].displacement[space.surface_nodes])
-    return PressedBall(surface, positions, _contact_mm(positions - [*place_mm, 0.0], radius_mm, depth_mm))
-
-
 def press_series(sensor: Sensor, radius_mm: float, deepest_mm: float, friction: float) -> BallSeries:
-    """Simulate a press in the middle to this depth, or what the gel bears; InputError as of `press_ball`."""
+    """Simulate a press in the middle to this depth, or what the gel bears; InputError where it does not complete."""
     deepest = min(deepest_mm, _DEEPEST * sensor.gel.size_mm[2])
-    trajectory = _simulated(sensor, radius_mm, deepest, np.zeros(2), friction, _STATES)
+    content = {
+        "name": "ball",
+        "sensor": sensor.model_dump(),
+        "contact": {"indenter": {"shape": "sphere", "radius_mm": radius_mm}, "friction": friction},
+        "motion": {"depth_mm": deepest, "steps": _STATES},
+        "numerics": {"target_error_px": _FINE_MM * pixels_per_mm(sensor)},
+    }
+    where = f"a ball of {radius_mm:g} mm pressed in by {deepest:.2g} mm"
+    scene = validated(content, where, Scene)
+    trajectory = simulate(scene, MeshRule.of(scene).resolution(scene).mesh)
+    if trajectory.status != "complete":
+        raise InputError(f"{where}: {trajectory.reason}")
     space = trajectory.space
     surface, depths = GelSurface(space.surface, _PARTS), np.linspace(0, deepest, _STATES + 1)
     moved = np.stack([state.displacement[space.surface_nodes] for state in trajectory.states])
     contacts = [_contact_mm(surface.positions(each), radius_mm, float(depth))
                 for each, depth in zip(moved, depths, strict=True)]  # fmt: skip
     return BallSeries(surface, make_interp_spline(depths, moved), np.column_stack([depths, contacts]), radius_mm)
-
-
-def _simulated(
-    sensor: Sensor, radius_mm: float, depth_mm: float, place_mm: FloatArray, friction: float, steps: int
-) -> Trajectory:
-    x, y = (float(value) for value in place_mm)
-    content = {
-        "name": "ball",
-        "sensor": sensor.model_dump(),
-        "contact": {"indenter": {"shape": "sphere", "radius_mm": radius_mm}, "friction": friction},
-        "motion": {"depth_mm": depth_mm, "position_mm": (x, y), "steps": steps},
-        "numerics": {"target_error_px": _FINE_MM * pixels_per_mm(sensor)},
-    }
-    scene = validated(content, f"a ball of {radius_mm:g} mm pressed in by {depth_mm:.2g} mm", Scene)
-    trajectory = simulate(scene, MeshRule.of(scene).resolution(scene).mesh)
-    if trajectory.status != "complete":
-        raise InputError(f"a ball of {radius_mm:g} mm pressed in by {depth_mm:.2g} mm: {trajectory.reason}")
-    return trajectory
 
 
 def _contact_mm(positions: Points, radius_mm: float, depth_mm: float) -> float:

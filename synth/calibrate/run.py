@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from synth.arrays import FloatArray
+from synth.arrays import FloatArray, Points
 from synth.calibrate.ball_fit import Balls
 from synth.calibrate.comparison import Comparison, compare, picture, render_gel
 from synth.calibrate.dot_grid import DotGridFit
 from synth.calibrate.frames import Frames, at_rest, read_frames
 from synth.calibrate.measured import FILE, FLAT, fit_measured
 from synth.calibrate.measured import written as measured_files
-from synth.calibrate.pressed_ball import PressedBall
 from synth.calibrate.report import contact_line, contact_numbers, fitted_content, numbers, summary
 from synth.calibrate.rest_map import measured_rest_map, with_rest_map
 from synth.calibrate.sensor_fit import SensorFit, find_bare, find_grid, fit_sensor
@@ -33,6 +32,7 @@ from synth.render.variant import LLVM_HINT, choose_variant
 from synth.scene import Dots, NoPattern, Render, Sensor
 from synth.scene.template import Template, checked_template, load_scene, replaced
 from synth.scene.validation import validated
+from synth.surface import GelSurface
 
 SCENE, PICTURE, NUMBERS, MAP = "scene.toml", "calibration.png", "calibration.json", "rest_map.png"
 MARK = "Fitted by `synth calibrate"
@@ -129,7 +129,7 @@ def _balls(
 
 
 def _contacts(
-    fit: SensorFit, balls: Balls | None, show: Callable[[PressedBall], FloatArray]
+    fit: SensorFit, balls: Balls | None, show: Callable[[tuple[GelSurface, Points]], FloatArray]
 ) -> tuple[dict[str, Comparison], list[dict[str, Any]]]:
     """Each press rendered and compared within its circle, by what its numbers say, and these numbers."""
     shown, contacts = {}, []
@@ -137,7 +137,7 @@ def _contacts(
         for press, changed in zip(fit.pressed.presses, fit.pressed.fitted, strict=True):
             frame = balls.frames[press.name]
             bare = fit.bare & find_bare(fit.sensor, frame) & (press.contact.away(frame.shape) < 1)
-            row = compare(frame, show(press.ball(fit.sensor, balls, fit.pressed.series)), bare, fit.sensor)
+            row = compare(frame, show(fit.pressed.series.pressed(press.pose)), bare, fit.sensor)
             contacts.append(contact_numbers(press, changed, row))
             shown[contact_line(contacts[-1]).replace(": ", "\n").replace("; ", "\n")] = row
     return shown, contacts

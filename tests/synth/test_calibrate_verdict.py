@@ -8,13 +8,13 @@ import pytest
 from render_scenes import FAST, needs_llvm
 from test_calibrate import _frame, _real_frame, _start
 
+from benchmarks.calibrations import press_ball
 from synth.arrays import FloatArray
 from synth.calibrate.comparison import Comparison, render_gel
 from synth.calibrate.contact import change, find_contact, flanks
 from synth.calibrate.dot_grid import fit_dot_grid
 from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import Frames, at_rest, read_frames
-from synth.calibrate.pressed_ball import press_ball
 from synth.calibrate.run import render_settings, start_sensor
 from synth.calibrate.sensor_fit import find_grid, fit_sensor
 from synth.calibrate.verdict import ALLOWED_OFF_GRID, common_displacement, verdict
