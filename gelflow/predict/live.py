@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from gelflow.arrays import Estimate, FlowArray, Frame
 from gelflow.errors import InputError
 from gelflow.files.video import newest_frames
+from gelflow.methods.fast import Fast
 from gelflow.methods.method import Method
 from gelflow.predict.prediction import Motion, motion_of
-from gelflow.predict.stream import Indexed, Reference, followed
+from gelflow.predict.stream import Indexed, Reference, Stream, followed
 
 LAST = 300
 """Frames over which latency and rate are measured."""
@@ -48,6 +49,9 @@ def follow(
     fewer than two frames, its frames change their size, or the method cannot use them.
     """
     arrivals: deque[tuple[int, float]] = deque(maxlen=2)
+    if isinstance(method, Fast):  # libraries load before the first frame can wait for them
+        noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+        Stream(method, noise, "first", markers=False).update(noise)
     with closing(newest_frames(source)) as newest:
 
         def noted() -> Iterator[Indexed]:
