@@ -1,6 +1,7 @@
 """Processes that run tests side by side leave one another a core each; `--permute` as `permuted` says."""
 
 import os
+from pathlib import Path
 
 import pytest
 
@@ -17,6 +18,13 @@ def pytest_configure(config: pytest.Config) -> None:
         from permuted import permute
 
         permute(config.getoption("permute"))
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With `-m cuda`, files without such a test are not imported: a GPU's machine need not have what they ask for."""
+    if config.option.markexpr == "cuda" and collection_path.match("test_*.py"):
+        return "mark.cuda" not in collection_path.read_text(encoding="utf-8") or None
+    return None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
