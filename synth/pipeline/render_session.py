@@ -117,7 +117,7 @@ class RenderSession:
             measured = read_measured_light(sensor, folder)
             surface = meshed if sensor.gel.is_round else rest_surface(sensor.gel)
             renderer = self._sensor.renderer if self._sensor else None
-            if renderer is None or not renderer.reuse(sensor, surface, painted, measured):
+            if renderer is None or not renderer.reuse(sensor, scene.render, surface, painted, measured):
                 renderer = Renderer(sensor, scene.render, surface, painted, variant, measured)
             seed = self._seed("rest", number)
             rest = None if sensor.gel.dome_radius_mm else renderer.radiances(surface.material, seed)

@@ -67,7 +67,7 @@ class Renderer:
     ) -> None:
         if variant.is_mono and not is_grey(sensor):
             raise ValueError(f"{variant.name} renders grey sensors only: choose the variant with grey=is_grey(sensor)")
-        self._variant, self._render, self._recordings = variant, render, Recordings()
+        self._variant, self._recordings = variant, Recordings()
         self._separated = is_separated(render, sensor, variant)
         mi = variant.load()
         check_views(sensor)
@@ -92,28 +92,30 @@ class Renderer:
         else:  # a path through Mitsuba's window is one interaction longer than one that starts inside
             depth = render.max_depth + refracts
             self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
-        self._use(sensor, albedo, measured)
+        self._use(sensor, render, albedo, measured)
 
-    def reuse(self, sensor: Sensor, surface: GelSurface, albedo: Image, measured: LightModel | None = None) -> bool:
+    def reuse(
+        self, sensor: Sensor, render: Render, surface: GelSurface, albedo: Image, measured: LightModel | None = None
+    ) -> bool:
         """Render this sensor from now on, if light is separated and it differs in numbers alone; else say False.
 
         What Dr.Jit has recorded of frames serves it, too.
         """
-        if not self._separated or self._parts(sensor) != self._built:
+        if not (self._separated and is_separated(render, sensor, self._variant)) or self._parts(sensor) != self._built:
             return False
         check_views(sensor)
         self._behind = reflecting_plane(sensor)
         self.take(surface)
         self._parameters["lights.vertex_positions"] = panel_corners(all_lights(sensor))
-        self._use(sensor, albedo, measured)
+        self._use(sensor, render, albedo, measured)
         return True
 
     def _parts(self, sensor: Sensor) -> tuple[Any, ...]:
         """What of a sensor is built into Mitsuba's scene, and is no number in it."""
         return len(all_lights(sensor)), reflecting_plane(sensor) is None, chart_of(sensor)
 
-    def _use(self, sensor: Sensor, albedo: Image, measured: LightModel | None) -> None:
-        mi, render = self._variant.load(), self._render
+    def _use(self, sensor: Sensor, render: Render, albedo: Image, measured: LightModel | None) -> None:
+        mi = self._variant.load()
         self._sensor, self._views = sensor, sensor.views
         lit = len(all_lights(sensor)) if self._variant.is_vectorised else sum(x.power > 0 for x in sensor.lights)
         self._lit = 1 if self._separated else lit  # separated: all at every sample
@@ -206,8 +208,7 @@ class Renderer:
         self._prepared = None
         if self._separated:
             mi, camera = self._variant.load(), self._views[""].camera
-            is_deep = self._render.max_depth > 2 and self._sensor.measured_light is None
-            frame = FrameGeometry(self._sensor, self._meshes["gel"], positions, is_deep)
+            frame = FrameGeometry(self._sensor, self._meshes["gel"], positions, self._light.is_deep)
             numbers = frame.numbers(_mitsuba_seed(seed, _LIGHT_PART, 0), mi)
             primary = min(camera.width * camera.height, _PIXELS) * self.samples_per_pixel
             static = (self._light.static, frame.sizes, primary, frame.bounces)

@@ -157,7 +157,7 @@ def test_a_reused_renderer_takes_other_light_and_its_frames_are_those_of_a_new_o
     before = shared.radiance(surface.material, 0)
     _written(tmp_path, values=1.1 * _coefficients())
     measured = read_measured_light(first, tmp_path)
-    assert shared.reuse(first, surface, plain(0.5), measured)
+    assert shared.reuse(first, RENDER, surface, plain(0.5), measured)
     found = shared.radiance(surface.material, 0)
     own = Renderer(first, RENDER, surface, plain(0.5), FAST, measured)
     np.testing.assert_array_equal(found, own.radiance(surface.material, 0))
