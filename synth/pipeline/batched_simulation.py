@@ -50,7 +50,7 @@ def in_batches(context: JobContext, tasks: Iterator[Task], batch: int | None) ->
     At most `batch` trajectories run at a time, which on a CPU changes no bit of what comes out. InputError where the
     storage refuses, or for CUDA without cuBLAS or cuSOLVER.
     """
-    simulation = _Simulation(context, tasks, batch or BATCH[context.plan.solver_device])
+    simulation = _Simulation(context, tasks, batch or BATCH[context.plan.device])
     return by_sensor(context.plan.template, simulation, simulation.open)
 
 
@@ -67,7 +67,7 @@ class _Simulation:
         self.open: Counter[int] = Counter()
 
     def __iter__(self) -> Iterator[tuple[int, Result]]:
-        if self._context.plan.solver_device == "cuda":  # on a new machine several modules compile at once
+        if self._context.plan.device == "cuda":  # on a new machine several modules compile at once
             wp.load_module("synth.simulate", "cuda", recursive=True, max_workers=os.cpu_count() or 1)
         with closing(self._firsts):
             yield from self._results()
@@ -143,7 +143,7 @@ def _first_instances(context: JobContext, begun: Iterator[Attempts]) -> Generato
 def _are_slow(context: JobContext) -> bool:
     plan = context.plan
     bodies = (corner.contact.indenter for corner in plan.template.corners)
-    return plan.solver_device == "cuda" and any(isinstance(body, MeshIndenter) for body in bodies)
+    return plan.device == "cuda" and any(isinstance(body, MeshIndenter) for body in bodies)
 
 
 def _drawer(context: JobContext) -> Maker[Attempts, Maybe]:

@@ -47,8 +47,7 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
     simulated = rendered.simulated
     diagnostics = _diagnostics(context, simulated)
     sensors = simulated.scene.sensor.views
-    device = "cuda" if context.plan.variant.is_on_gpu else "cpu"
-    views = {name: View(rendered.surface, Optics.of(sensor), device) for name, sensor in sensors.items()}
+    views = {name: View(rendered.surface, Optics.of(sensor), context.plan.device) for name, sensor in sensors.items()}
     count, entries, warning = len(simulated.samples), [], ""
     shared = {"simulate": simulated.seconds / count, "render": rendered.seconds / count}
     for shown in simulated.samples:

@@ -10,7 +10,7 @@ class Pads:
     """The pad that was used last: mesh, tables and preconditioner, which take seconds to prepare."""
 
     def __init__(self, context: JobContext) -> None:
-        self._device = context.plan.solver_device
+        self._device = context.plan.device
         self._cached: tuple[Gel, Pad] | None = None
 
     def of(self, press: Press) -> Pad:

@@ -38,20 +38,23 @@ class Plan:
     """What runs, for all samples of a scene; picklable.
 
     `template.outputs` and `template.sampling` are the same for all. With `is_batched` trajectories are simulated many
-    at once, on one mesh for all of a pad. Decisions are feature by feature, with reasons; light and lens among them are
-    each sensor's own.
+    at once, on one mesh for all of a pad. Light and lens are each sensor's own: no field has them.
     """
 
     template: Template
     variant: Variant
     is_batched: bool
     mesh: MeshRule
-    decisions: tuple[Decision, ...]
 
     @property
-    def solver_device(self) -> Literal["cuda", "cpu"]:
-        """The device of the batched solver: that of the renderer."""
+    def device(self) -> Literal["cuda", "cpu"]:
+        """Where the batched solver runs, and the flow is traced: where pictures are rendered."""
         return "cuda" if self.variant.is_on_gpu else "cpu"
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        """Feature by feature what runs for some sample at least, with the reason."""
+        return _decisions(self)
 
     def record(self) -> dict[str, Any]:
         named = {"scene": self.template.name, "variant": self.variant.name}
@@ -78,9 +81,10 @@ def plan(scene: Template | str | Path, variant: Variant | None = None) -> Plan:
     variant = variant or job_variant(scene, "auto")
     check_buildable(scene, variant)
     round_first = sorted(scene.corners, key=lambda corner: not corner.sensor.gel.is_round)
-    batched, reason = _batching(scene, variant)
-    decisions = (Decision("batched simulation", batched, reason), *_decisions(scene, variant))
-    return Plan(scene, variant, batched, MeshRule.of(round_first[0], batched), decisions)
+    posed, solver = any(corner.motion.poses for corner in scene.corners), scene.numerics.solver
+    suits = variant.is_on_gpu and not posed and not _own_pads(scene)
+    batched = solver == "batched" or (solver == "auto" and suits)
+    return Plan(scene, variant, batched, MeshRule.of(round_first[0], batched))
 
 
 def check_buildable(template: Template, variant: Variant) -> None:
@@ -89,7 +93,8 @@ def check_buildable(template: Template, variant: Variant) -> None:
     InputError, at a corner of the distributions, for an indenter whose parts do not fit or whose file is no surface, a
     gel from files that is too thin or is pressed beside its face, a light in the camera's view, a lens or a kind of
     light that this variant or coating cannot have, a pattern that no pixel could show or whose file is no picture, a
-    rest map or measured light that does not fit camera or lights, or more pairs than a trajectory has.
+    rest map or measured light that does not fit camera or lights, more pairs than a trajectory has, or poses for the
+    batched solver.
     """
     try:
         for sensor in dict.fromkeys(corner.sensor for corner in template.corners):
@@ -113,13 +118,14 @@ def check_buildable(template: Template, variant: Variant) -> None:
                 path_of(corner, template.folder).check()
             is_separated(corner.render, corner.sensor, variant)
             check_pairs(corner)
+            if corner.motion.poses and corner.numerics.solver == "batched":
+                raise InputError('numerics.solver = "batched": it takes no motion.poses; give "single" or "auto"')
     except InputError as error:
         raise InputError(f"{template.label}: {error}") from error
 
 
-def _decisions(template: Template, variant: Variant) -> tuple[Decision, ...]:
-    corners = template.corners
-    outputs = template.outputs
+def _decisions(plan: Plan) -> tuple[Decision, ...]:
+    variant, corners, outputs = plan.variant, plan.template.corners, plan.template.outputs
     depth, friction = [c.motion.depth_mm for c in corners], [c.contact.friction for c in corners]
     posed = any(c.motion.poses for c in corners)
     poisson = [c.sensor.gel.poisson_ratio for c in corners]
@@ -147,6 +153,7 @@ def _decisions(template: Template, variant: Variant) -> tuple[Decision, ...]:
     foam = "" if mixed else ": a compressible foam needs none"
     smooth = "" if max(friction) > 0 else ": half the matrix is enough"
     return (
+        Decision("batched simulation", plan.is_batched, _batching_reason(plan, posed)),
         Decision("pictures", outputs.images, f"outputs.images = {str(outputs.images).lower()}"),
         Decision("simulation", posed or max(depth) > 0, "motion.poses" if posed else _span("motion.depth_mm", depth)),
         Decision("friction state", max(friction) > 0, _span("contact.friction", friction) + smooth),
@@ -165,23 +172,21 @@ def _decisions(template: Template, variant: Variant) -> tuple[Decision, ...]:
     )
 
 
-def _batching(template: Template, variant: Variant) -> tuple[bool, str]:
-    """Whether trajectories are simulated many at once, and why."""
-    solver = template.numerics.solver
+def _batching_reason(plan: Plan, posed: bool) -> str:
+    solver, drawn = plan.template.numerics.solver, _own_pads(plan.template)
     reason = f'numerics.solver = "{solver}"'
+    if posed:
+        return f"{reason}, and motion.poses are simulated one by one"
+    if drawn and (solver == "batched" or plan.variant.is_on_gpu):
+        return f"{reason}: but {', '.join(drawn)} make each sensor's pad another, with a mesh and a batch of its own"
+    return f"{reason}, and {plan.variant.name} renders" if solver == "auto" else reason
+
+
+def _own_pads(template: Template) -> list[str]:
+    """The distributions by which each sensor's pad needs a mesh of its own."""
     # Without layers stiffness only scales forces, so that pads which differ in nothing else share a mesh.
     alike = () if template.corners[0].sensor.gel.layers else ("sensor.gel.youngs_modulus_kpa",)
-    drawn = [at for _, _, at in template.distributions() if at.startswith("sensor.gel.") and at not in alike]
-    posed = any(corner.motion.poses for corner in template.corners)
-    if posed and solver == "batched":
-        raise InputError(f'{template.label}: {reason}: it takes no motion.poses; give "single" or "auto"')
-    if posed:
-        reason += ", and motion.poses are simulated one by one"
-    elif drawn and (solver == "batched" or variant.is_on_gpu):
-        reason += f": but {', '.join(drawn)} make each sensor's pad another, with a mesh and a batch of its own"
-    elif solver == "auto":
-        reason += f", and {variant.name} renders"
-    return solver == "batched" or (solver == "auto" and variant.is_on_gpu and not drawn and not posed), reason
+    return [at for _, _, at in template.distributions() if at.startswith("sensor.gel.") and at not in alike]
 
 
 def _span(name: str, values: Sequence[float]) -> str:

@@ -243,6 +243,6 @@ def _simulation_seconds(scene: Scene, nodes: int, plan: Plan) -> float:
     if isinstance(scene.contact.indenter, MeshIndenter):
         iterations *= MESH_INDENTER
     if plan.is_batched:
-        return iterations * BATCHED_SECONDS[plan.solver_device] * (nodes / BATCHED_NODES) ** BATCHED_GROWTH
+        return iterations * BATCHED_SECONDS[plan.device] * (nodes / BATCHED_NODES) ** BATCHED_GROWTH
     friction = FRICTION if scene.contact.friction > 0 else 1.0
     return iterations * SOLVE_SECONDS * friction * (nodes / SOLVE_NODES) ** SOLVE_GROWTH
