@@ -31,13 +31,12 @@ CHORDS = 0.03
 """Share of a round gel's volume that flat faces may add or take away."""
 
 
-def default_edge_length(gel: Gel) -> float:
-    """A fifth of the gel's thickness, at most 1 mm; of a round gel, whose one mesh serves all trajectories, four fifths
-    of it and at most a sixth of the radius.
+def edge_length(gel: Gel, numerics: Numerics) -> float:
+    """Edge length (mm) of fTetWild's mesh at the contact face: as given, or by default a fifth of the gel's thickness,
+    at most 1 mm; of a round gel, whose one mesh serves all trajectories, four fifths and at most a sixth of the radius.
     """
-    if gel.is_round:
-        return min(0.8 * gel.depth_mm, gel.size_mm[0] / 12)
-    return min(gel.size_mm[2] / 5, 1.0)
+    default_mm = min(0.8 * gel.depth_mm, gel.size_mm[0] / 12) if gel.is_round else min(gel.size_mm[2] / 5, 1.0)
+    return numerics.edge_length_mm or default_mm
 
 
 def mesh_key(gel: Gel, numerics: Numerics) -> str:
@@ -45,7 +44,7 @@ def mesh_key(gel: Gel, numerics: Numerics) -> str:
     recipe: dict[str, object] = {
         "shape": gel.shape,
         "size_mm": gel.size_mm,
-        "edge_length_mm": numerics.edge_length_mm or default_edge_length(gel),
+        "edge_length_mm": edge_length(gel, numerics),
         "grading": GRADING,
         "envelope": ENVELOPE,
     }
@@ -73,7 +72,7 @@ def pad_mesh(
     paths = [folder / f"{key}.npz" for folder in (folders if folders is not None else [user_cache()])]
     mesh = next((found for path in paths if (found := _read(path, gel, face)) is not None), None)
     if mesh is None:
-        mesh = _made(gel, face, numerics.edge_length_mm or default_edge_length(gel))
+        mesh = _made(gel, face, edge_length(gel, numerics))
     for path in paths:
         if _read(path, gel, face) is None:
             _write(path, mesh)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from synth.errors import InputError
-from synth.mesh import default_edge_length, face_of
+from synth.mesh import edge_length, face_of
 from synth.mesh.cad import CadFace
 from synth.press.indenter import object_triangles, rigid_body
 from synth.press.press import MeshRule
@@ -113,7 +113,7 @@ def check_buildable(template: Template, variant: Variant) -> None:
         for corner in template.corners:
             gel = corner.sensor.gel
             if isinstance(face := face_of(gel, template.folder), CadFace):
-                face.check(corner.motion, corner.numerics.edge_length_mm or default_edge_length(gel))
+                face.check(corner.motion, edge_length(gel, corner.numerics))
             if corner.motion.poses and corner.contact.indenter.rotation_deg != "any":
                 path_of(corner, template.folder).check()
             is_separated(corner.render, corner.sensor, variant)

@@ -12,7 +12,7 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.errors import InputError
-from synth.mesh import default_edge_length
+from synth.mesh import edge_length
 from synth.mesh.layered import elements_through
 from synth.planning.plan import Plan
 from synth.press.press import edge_radius_mm
@@ -160,8 +160,7 @@ def _lost_detail(plan: Plan) -> str:
             indenter = scene.contact.indenter
             if isinstance(indenter, MeshIndenter) and indenter.fillet_mm is None:
                 found = None if rule.kind == "tetwild" else rule.resolution(scene, template.folder)
-                edge_mm = scene.numerics.edge_length_mm or default_edge_length(scene.sensor.gel)
-                spacing = found.mesh.spacing_mm if found else edge_mm
+                spacing = found.mesh.spacing_mm if found else edge_length(scene.sensor.gel, scene.numerics)
                 body = path_of(scene, template.folder, resolution_mm(scene, spacing)).body
                 return rule.lost_detail(scene, body, found)
     return ""
@@ -204,7 +203,7 @@ def _tetwild_meshes(plan: Plan) -> _Meshes:
     """Meshes of the corners, estimated without meshing; fTetWild takes long."""
     first = plan.template.corners[0]
     gel = first.sensor.gel
-    edge_mm = plan.template.numerics.edge_length_mm or default_edge_length(gel)
+    edge_mm = edge_length(gel, plan.template.numerics)
     x, y, z = (length / edge_mm for length in _plate(gel))
     per_area = NODES_PER_CURVED_AREA if gel.is_round else NODES_PER_AREA
     vertices = NODES_PER_VOLUME * x * y * z + per_area * 2 * (x * y + y * z + z * x)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from synth.errors import InputError
-from synth.mesh import PadMesh, default_edge_length, pad_mesh
+from synth.mesh import PadMesh, edge_length, pad_mesh
 from synth.press.indenter import RigidBody, object_radius
 from synth.press.load_path import LoadPath
 from synth.press.resolution import (
@@ -121,8 +121,7 @@ class MeshRule:
                 return Resolution(**vars(found), mesh=mesh, through=numerics.cells[2], spacing_mm=spacing)
             case "tetwild":
                 mesh = pad_mesh(gel, numerics, mesh_folders, folder)
-                edge_mm = numerics.edge_length_mm or default_edge_length(gel)
-                return Resolution(0, float("nan"), float("nan"), mesh, 0, edge_mm)
+                return Resolution(0, float("nan"), float("nan"), mesh, 0, edge_length(gel, numerics))
 
     def check_edges(self, scene: Scene, mesh: PadMesh) -> None:
         """InputError where the indenter's edges are stated to be sharper than a mesh resolves."""
@@ -153,8 +152,7 @@ class MeshRule:
         if self.kind == "even":
             setting += f" with numerics.cells = [{2 * cells[0]}, {2 * cells[1]}, {cells[2] + 1}]"
         elif self.kind == "tetwild":
-            edge = scene.numerics.edge_length_mm or default_edge_length(scene.sensor.gel)
-            setting += f" with numerics.edge_length_mm = {edge / 2:.2g}"
+            setting += f" with numerics.edge_length_mm = {edge_length(scene.sensor.gel, scene.numerics) / 2:.2g}"
         return (
             f"{indenter.file}: the gel's mesh rounds edges and notches to a radius of {radius:.2g} mm "
             f"({radius * scale:.2g} px), which moves the surface by up to {body.lost_mm:.2g} mm "

@@ -13,7 +13,7 @@ from pads import area_vectors, brick, contact_faces, crooked
 import synth.mesh.cache as cache
 from benchmarks.focused_mesh import around_focus
 from synth.arrays import FloatArray
-from synth.mesh import Focus, PadMesh, check_mesh, default_edge_length, mesh_key, pad_mesh
+from synth.mesh import Focus, PadMesh, check_mesh, edge_length, mesh_key, pad_mesh
 from synth.mesh.pad import boundary_faces, signed_volumes
 from synth.mesh.tetrahedralise import (
     GRADING,
@@ -231,10 +231,10 @@ def test_key_depends_on_what_the_mesh_depends_on_only_and_on_the_default_edge() 
     assert mesh_key(GEL, Numerics(edge_length_mm=1.4)) != key
     assert mesh_key(GEL.model_copy(update={"youngs_modulus_kpa": 7.0, "poisson_ratio": 0.3}), NUMERICS) == key
     assert mesh_key(GEL, Numerics(edge_length_mm=1.5, tolerance=1e-4)) == key
-    assert mesh_key(GEL, Numerics()) == mesh_key(GEL, Numerics(edge_length_mm=default_edge_length(GEL)))
+    assert mesh_key(GEL, Numerics()) == mesh_key(GEL, Numerics(edge_length_mm=edge_length(GEL, Numerics())))
     for thickness, edge in ((2.0, 0.4), (4.0, 0.8), (8.0, 1.0)):
         gel = GEL.model_copy(update={"size_mm": (20.0, 20.0, thickness)})
-        assert default_edge_length(gel) == pytest.approx(edge)
+        assert edge_length(gel, Numerics()) == pytest.approx(edge)
 
 
 def test_edges_are_small_in_the_focus_only() -> None:
