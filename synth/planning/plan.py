@@ -14,10 +14,10 @@ from synth.press.scene_path import path_of
 from synth.render.camera_rays import pinhole
 from synth.render.coating import is_separated
 from synth.render.measured_light import read_measured_light
-from synth.render.pattern import check_pattern, is_grey
+from synth.render.pattern import check_pattern
 from synth.render.rest_map import read_rest_map
 from synth.render.thin_lens import check_views
-from synth.render.variant import Variant, job_variant
+from synth.render.variant import Variant, always_grey, job_variant
 from synth.sampling import check_pairs
 from synth.scene import MeshIndenter
 from synth.scene.template import Template, load_scene
@@ -38,7 +38,7 @@ class Plan:
     """What runs, for all samples of a scene; picklable.
 
     `template.outputs` and `template.sampling` are the same for all. With `is_batched` trajectories are simulated many
-    at once, on one mesh for all of a pad. Light and lens are each sensor's own: no field has them.
+    at once, on one mesh for all of a pad. Light and lens are each sensor's own.
     """
 
     template: Template
@@ -54,7 +54,51 @@ class Plan:
     @property
     def decisions(self) -> tuple[Decision, ...]:
         """Feature by feature what runs for some sample at least, with the reason."""
-        return _decisions(self)
+        variant, corners, outputs = self.variant, self.template.corners, self.template.outputs
+        sensors, posed = [c.sensor for c in corners], any(c.motion.poses for c in corners)
+        depth = [max(stop.depth_mm for stop in c.motion.stops.values()) for c in corners]
+        press = "motion.poses" if posed else _span("motion.depth_mm", depth)
+        friction, poisson = [c.contact.friction for c in corners], [s.gel.poisson_ratio for s in sensors]
+        index, bounces = [s.window.refractive_index for s in sensors], [c.render.max_depth for c in corners]
+        mixed = max(poisson) >= DISPLACEMENT_ONLY_BELOW
+        cameras = [view.camera for s in sensors for view in s.views.values()]
+        apertures = [camera.aperture_mm for camera in cameras]
+        pinhole = "" if max(apertures) > 0 else ": a pinhole"
+        lens = any(any(camera.distortion) or camera.lens == "fisheye" for camera in cameras)
+        own_frames = ": domes have own frames" if any(s.gel.dome_radius_mm for s in sensors) else ""
+        mirrors, further = max(len(s.mirrors) for s in sensors), max(len(s.further_cameras) for s in sensors)
+        lights = {c.render.light for c in corners}
+        separated = any(is_separated(c.render, c.sensor, variant) for c in corners)
+        instead = f", but {variant.name} path-traces" if "separated" in lights and not separated else ""
+        contained = ": measured light contains it" if all(s.measured_light for s in sensors) else ""
+        paths = _span("render.max_depth", bounces) + contained
+        hue = "lights, coating and pattern are grey"
+        if not always_grey(self.template):
+            hue = "a light, the coating, the pattern or a rest map has colour"
+        elif not variant.is_mono:
+            hue += f", but {variant.name} has no grey counterpart here"
+        names = ("depth", "normal", "displacement", "traction", "contact", "slip", "previous")
+        optional = [name for name in names if getattr(outputs, name)]
+        foam = "" if mixed else ": a compressible foam needs none"
+        smooth = "" if max(friction) > 0 else ": half the matrix is enough"
+        return (
+            Decision("batched simulation", self.is_batched, _batching_reason(self, posed)),
+            Decision("pictures", outputs.images, f"outputs.images = {str(outputs.images).lower()}"),
+            Decision("simulation", posed or max(depth) > 0, press),
+            Decision("friction state", max(friction) > 0, _span("contact.friction", friction) + smooth),
+            Decision("pressure field", mixed, _span("sensor.gel.poisson_ratio", poisson) + foam),
+            Decision("window refraction", max(index) > 1, _span("sensor.window.refractive_index", index)),
+            Decision("lens distortion", lens, "sensor.camera.distortion" + ("" if lens else " is zero: a pinhole")),
+            Decision("shared undeformed frame", not own_frames, "sensor.gel.shape" + own_frames),
+            Decision("depth of field", max(apertures) > 0, _span("sensor.camera.aperture_mm", apertures) + pinhole),
+            Decision("mirrors", mirrors > 0, f"{mirrors} in sensor.mirrors"),
+            Decision("further cameras", further > 0, f"{further} in sensor.further_cameras"),
+            Decision("separated light", separated, f"render.light = {' or '.join(sorted(lights))}{instead}"),
+            Decision("indirect light", max(bounces) > 2 and not contained, paths),
+            Decision("colour", not variant.is_mono, hue),
+            Decision("backward flow", outputs.backward, f"outputs.backward = {str(outputs.backward).lower()}"),
+            Decision("optional channels", bool(optional), ", ".join(optional) or "none asked for in outputs"),
+        )
 
     def record(self) -> dict[str, Any]:
         named = {"scene": self.template.name, "variant": self.variant.name}
@@ -80,11 +124,9 @@ def plan(scene: Template | str | Path, variant: Variant | None = None) -> Plan:
     scene = scene if isinstance(scene, Template) else load_scene(scene)
     variant = variant or job_variant(scene, "auto")
     check_buildable(scene, variant)
-    round_first = sorted(scene.corners, key=lambda corner: not corner.sensor.gel.is_round)
-    posed, solver = any(corner.motion.poses for corner in scene.corners), scene.numerics.solver
-    suits = variant.is_on_gpu and not posed and not _own_pads(scene)
-    batched = solver == "batched" or (solver == "auto" and suits)
-    return Plan(scene, variant, batched, MeshRule.of(round_first[0], batched))
+    suits = variant.is_on_gpu and not any(corner.motion.poses for corner in scene.corners) and not _own_pads(scene)
+    batched = scene.numerics.solver == "batched" or (scene.numerics.solver == "auto" and suits)
+    return Plan(scene, variant, batched, MeshRule.of(max(scene.corners, key=lambda c: c.sensor.gel.is_round), batched))
 
 
 def check_buildable(template: Template, variant: Variant) -> None:
@@ -122,54 +164,6 @@ def check_buildable(template: Template, variant: Variant) -> None:
                 raise InputError('numerics.solver = "batched": it takes no motion.poses; give "single" or "auto"')
     except InputError as error:
         raise InputError(f"{template.label}: {error}") from error
-
-
-def _decisions(plan: Plan) -> tuple[Decision, ...]:
-    variant, corners, outputs = plan.variant, plan.template.corners, plan.template.outputs
-    depth, friction = [c.motion.depth_mm for c in corners], [c.contact.friction for c in corners]
-    posed = any(c.motion.poses for c in corners)
-    poisson = [c.sensor.gel.poisson_ratio for c in corners]
-    index, bounces = [c.sensor.window.refractive_index for c in corners], [c.render.max_depth for c in corners]
-    mixed = max(poisson) >= DISPLACEMENT_ONLY_BELOW
-    cameras = [view.camera for c in corners for view in c.sensor.views.values()]
-    lens = any(any(camera.distortion) or camera.lens == "fisheye" for camera in cameras)
-    flat = all(c.sensor.gel.is_flat for c in corners)
-    own_frames = "" if flat else ": curved faces have own frames"
-    apertures = [camera.aperture_mm for camera in cameras]
-    pinhole = "" if max(apertures) > 0 else ": a pinhole"
-    mirrors, further = len(corners[0].sensor.mirrors), len(corners[0].sensor.further_cameras)
-    light = corners[0].render.light
-    separated = is_separated(corners[0].render, corners[0].sensor, variant)
-    instead = f", but {variant.name} path-traces" if light == "separated" and not separated else ""
-    contained = "" if corners[0].sensor.measured_light is None else ": measured light contains it"
-    grey = all(is_grey(c.sensor) for c in corners)
-    hue = (
-        "lights, coating and pattern are grey" if grey else "a light, the coating, the pattern or a rest map has colour"
-    )
-    if grey and not variant.is_mono:
-        hue += f", but {variant.name} has no grey counterpart here"
-    names = ("depth", "normal", "displacement", "traction", "contact", "slip", "previous")
-    optional = [name for name in names if getattr(outputs, name)]
-    foam = "" if mixed else ": a compressible foam needs none"
-    smooth = "" if max(friction) > 0 else ": half the matrix is enough"
-    return (
-        Decision("batched simulation", plan.is_batched, _batching_reason(plan, posed)),
-        Decision("pictures", outputs.images, f"outputs.images = {str(outputs.images).lower()}"),
-        Decision("simulation", posed or max(depth) > 0, "motion.poses" if posed else _span("motion.depth_mm", depth)),
-        Decision("friction state", max(friction) > 0, _span("contact.friction", friction) + smooth),
-        Decision("pressure field", mixed, _span("sensor.gel.poisson_ratio", poisson) + foam),
-        Decision("window refraction", max(index) > 1, _span("sensor.window.refractive_index", index)),
-        Decision("lens distortion", lens, "sensor.camera.distortion" + ("" if lens else " is zero: a pinhole")),
-        Decision("shared undeformed frame", flat, "sensor.gel.shape" + own_frames),
-        Decision("depth of field", max(apertures) > 0, _span("sensor.camera.aperture_mm", apertures) + pinhole),
-        Decision("mirrors", mirrors > 0, f"{mirrors} in sensor.mirrors"),
-        Decision("further cameras", further > 0, f"{further} in sensor.further_cameras"),
-        Decision("separated light", separated, f"render.light = {light}{instead}"),
-        Decision("indirect light", max(bounces) > 2 and not contained, _span("render.max_depth", bounces) + contained),
-        Decision("colour", not variant.is_mono, hue),
-        Decision("backward flow", outputs.backward, f"outputs.backward = {str(outputs.backward).lower()}"),
-        Decision("optional channels", bool(optional), ", ".join(optional) or "none asked for in outputs"),
-    )
 
 
 def _batching_reason(plan: Plan, posed: bool) -> str:

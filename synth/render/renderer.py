@@ -116,7 +116,7 @@ class Renderer:
 
     def _use(self, sensor: Sensor, render: Render, albedo: Image, measured: LightModel | None) -> None:
         mi = self._variant.load()
-        self._sensor, self._views = sensor, sensor.views
+        self._sensor, self._render, self._views = sensor, render, sensor.views
         lit = len(all_lights(sensor)) if self._variant.is_vectorised else sum(x.power > 0 for x in sensor.lights)
         self._lit = 1 if self._separated else lit  # separated: all at every sample
         self._light: Any = None
@@ -208,7 +208,8 @@ class Renderer:
         self._prepared = None
         if self._separated:
             mi, camera = self._variant.load(), self._views[""].camera
-            frame = FrameGeometry(self._sensor, self._meshes["gel"], positions, self._light.is_deep)
+            is_deep = self._render.max_depth > 2 and self._sensor.measured_light is None
+            frame = FrameGeometry(self._sensor, self._meshes["gel"], positions, is_deep)
             numbers = frame.numbers(_mitsuba_seed(seed, _LIGHT_PART, 0), mi)
             primary = min(camera.width * camera.height, _PIXELS) * self.samples_per_pixel
             static = (self._light.static, frame.sizes, primary, frame.bounces)

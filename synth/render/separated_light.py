@@ -112,11 +112,6 @@ class SeparatedLight:
         self._words = -(-(len(own) + len(images)) // _BITS)
 
     @property
-    def is_deep(self) -> bool:
-        """Whether bounced light is followed; measured light contains it."""
-        return self.max_depth > 2 and self._measured is None
-
-    @property
     def static(self) -> tuple[Any, ...]:
         """What of the light is compiled into kernels."""
         tables = tuple(table.static for table in self._lights)

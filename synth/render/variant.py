@@ -115,9 +115,13 @@ def choose_variant(device: Device = "auto", grey: bool = False) -> Variant:
 
 def job_variant(template: Template, device: Device) -> Variant:
     """What renders a job: one channel where every instance of it is grey; InputError where the device is not there."""
-    # Corners that are grey say nothing of what lies between them where a single channel is drawn.
+    return choose_variant(device, grey=always_grey(template))
+
+
+def always_grey(template: Template) -> bool:
+    """Whether every instance is grey; where a single channel is drawn, grey corners do not tell."""
     drawn = any(re.search(r"\.(color|reflectance)\[\d\]$|\.saturation$", at) for _, _, at in template.distributions())
-    return choose_variant(device, grey=not drawn and all(is_grey(scene.sensor) for scene in template.corners))
+    return not drawn and all(is_grey(scene.sensor) for scene in template.corners)
 
 
 def cpu_variant(candidates: Iterable[Path], version_of: Callable[[Path], Version | None], kind: str) -> Variant:

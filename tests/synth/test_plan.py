@@ -23,6 +23,8 @@ from synth.scene.template import load_scene, shipped_scenes
 
 LLVM, MONO, SCALAR = Variant("llvm_ad_rgb", ""), Variant("llvm_ad_mono", ""), Variant("scalar_rgb", "")
 AWAY = "sensor.lights=[{position_mm=[3, 0, 3], aim_mm=[3, 0, 4], size_mm=[1, 1], color=[1, 1, 1], power=1}]"
+MIRROR = "{ position_mm = [-9, 0, 12], normal = [1, 0, 0], size_mm = [2, 2] }"
+CAMERA = '{ name = "left", position_mm = [-2, 0.5, 19], width = 16, height = 16, fx = 80, fy = 80, cx = 8, cy = 8 }'
 GREY = [f"sensor.lights.{i}.color=[1, 1, 1]" for i in range(5)]
 
 
@@ -77,6 +79,9 @@ def test_one_draw_that_needs_a_feature_is_enough_and_nodes_are_about_the_meshs(t
         "window refraction": "sensor.window.refractive_index={ choice = [1, 1.4] }",
         "indirect light": "render.max_depth={ choice = [2, 3] }",
         "simulation": "motion.depth_mm={ choice = [-0.1, 0.2] }",
+        "separated light": 'render.light={ choice = ["path_traced", "separated"] }',
+        "mirrors": f"sensor.mirrors={{ choice = [[], [{MIRROR}]] }}",
+        "further cameras": f"sensor.further_cameras={{ choice = [[], [{CAMERA}]] }}",
     }
     decided = _decided(tiny, *needed_by_one.values())
     assert all(decided[feature][0] for feature in needed_by_one)
@@ -86,6 +91,19 @@ def test_one_draw_that_needs_a_feature_is_enough_and_nodes_are_about_the_meshs(t
     mesh = pad_mesh(scene.sensor.gel, scene.numerics, [tmp_path / "meshes"])
     # The fit is 12 % off here and the mesher is random; promised is a factor of three in times, as nodes^1.6.
     assert predict(plan(template, LLVM)).nodes == pytest.approx(len(mesh.points), rel=0.3)
+
+
+def test_reasons_are_those_by_which_frames_are_shared_presses_touch_and_one_channel_is_rendered(tiny: Path) -> None:
+    later = _decided(tiny, "motion.depth_mm=-0.1", "motion.then=[{ depth_mm = 0.2 }]")
+    assert later["simulation"] == (True, "motion.depth_mm = 0.2")
+    domed = _decided(tiny, 'sensor.gel.shape="dome"', "sensor.gel.dome_radius_mm=30")
+    assert domed["shared undeformed frame"] == (False, "sensor.gel.shape: domes have own frames")
+    shares = {d.feature: d.runs for d in plan(load_scene("densetact"), LLVM).decisions}
+    assert shares["shared undeformed frame"], "all trajectories on a round gel have one mesh"
+    channels = f"sensor.coating.reflectance=[{', '.join(3 * ['{ uniform = [0.5, 0.6] }'])}]"
+    runs, reason = _decided(tiny, *GREY, channels)["colour"]
+    assert runs
+    assert reason.endswith("has colour")
 
 
 @pytest.mark.parametrize(("overrides", "grey"), [
