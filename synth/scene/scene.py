@@ -80,7 +80,7 @@ class Scene(Part):
         for name in ("slip", "previous"):
             if getattr(self.outputs, name) and self.sampling.kind != "clips":
                 raise ValueError(f'outputs.{name} = true: pairs have no frame before; give sampling.kind = "clips"')
-        deepest = 0.85 * (gel.depth_mm - (0.0 if gel.is_round else gel.face_mm(*motion.position_mm)))
+        deepest = 0.85 * (gel.depth_mm - gel.face_mm(*motion.position_mm))
         if motion.depth_mm < -50:
             raise ValueError(f"motion.depth_mm = {motion.depth_mm} leaves the indenter farther than 50 mm off the gel")
         for axis, x, half in zip("xy", motion.position_mm, (size[0] / 2, size[1] / 2), strict=True):
