@@ -131,7 +131,7 @@ def _outcomes_of_pool(
 
 @contextlib.contextmanager
 def _starting() -> Iterator[None]:
-    """Workers are started meanwhile, by whoever submits; main_left_out comes first: it keeps others from doing so."""
+    """Workers are started meanwhile, by one thread at a time: the lock of main_left_out guards the environment, too."""
     with interrupts_blocked(), main_left_out(), one_thread_each():
         yield
 
