@@ -105,8 +105,8 @@ def refined(flow: FlowArray, first: Prepared, second: Prepared, before: Refined 
     grid = (one.grid[0] // 2, one.grid[1] // 2)
     cells = _tensor(4 * resized(cv2.merge([*texture, *squares_of_z, *cv2.split(pull)]), grid))
     window, wide = (window_sums(cells, width / CELL) for width in (narrow_px, wide_px))
-    gradients, gradient = cells[:, :3], cells[:, :1] + cells[:, 2:3]
-    step, variance, _ = solved(gradients, cells[:, 3:6], cells[:, 6:], window)
+    gradient = cells[:, :1] + cells[:, 2:3]
+    step, variance, _ = solved(window(cells))
     variance = (TWO_STEPS * variance).clamp(MIN_VARIANCE, MAX_VARIANCE)
     known, textured = variance < UNKNOWN_PX**2, window(gradient)
     posterior = posterior_variance(variance, CONFIG.prior_px)

@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gelflow.arrays import Features, Flow, Images
-from gelflow.ops.gaussian import SeparableFilter, window_sums
+from gelflow.ops.gaussian import window_sums
 from gelflow.ops.warp import inside_at, positions
 
 TINY = 1e-6
@@ -76,6 +76,12 @@ def moments(flow: Flow, first: Images, second: Sample, background_px: float | No
 
     They are sums over the colours, zero where the flow leaves the image, (B, 7, H, W).
     """
+    if flow.is_cuda and background_px is not None:
+        from gelflow.models import fused_registration as fused
+
+        moved = second(positions(flow))
+        weighted = fused.counted(flow, first, moved, both=False)
+        return fused.moments(first, moved, weighted, window_sums(flow, background_px, 2)(weighted))
     residual, mean, counts = compared(flow, first, second)
     if background_px is not None:
         residual = without_mean(residual, counts, background_px)
@@ -86,6 +92,14 @@ def moments(flow: Flow, first: Images, second: Sample, background_px: float | No
 
 def evidence(flow: Flow, first: Images, second: Sample, background_px: float) -> Tensor:
     """What each pixel adds to A and to z z^T under a flow, three each, and to -b: (B, 8, H, W)."""
+    correlated, norm = window_sums(flow, CORRELATION_PX), math.sqrt(math.pi) * CORRELATION_PX
+    if flow.is_cuda:
+        from gelflow.models import fused_registration as fused
+
+        moved = second(positions(flow))
+        weighted = fused.counted(flow, first, moved, both=True)
+        found = fused.evidence(first, moved, weighted, window_sums(flow, background_px, 2)(weighted))
+        return fused.add_squares(found, correlated(found[:, 6:]), norm**-2)
     residual, mean, counts = compared(flow, first, second)
     both = without_mean(torch.cat([residual, mean], dim=1), counts, background_px)
     residual, mean = both.chunk(2, dim=1)
@@ -93,23 +107,26 @@ def evidence(flow: Flow, first: Images, second: Sample, background_px: float) ->
     gradients = ((across, across), (across, down), (down, down))
     noise = ((right, right), (right, below), (below, below))
     found = counts * _products((*gradients, *noise, (across, residual), (down, residual)))
-    z = window_sums(flow, CORRELATION_PX)(found[:, 6:]) / (math.sqrt(math.pi) * CORRELATION_PX)
+    z = correlated(found[:, 6:]) / norm
     return torch.cat([found[:, :3] - found[:, 3:6], _squares(z), found[:, 6:]], dim=1)
 
 
 def step(found: Tensor, window_px: float, spacing: int = 1) -> Step:
     """The step of `evidence` in a window of that standard deviation, without a prior, at places at a spacing."""
-    return solved(found[:, :3], found[:, 3:6], found[:, 6:], window_sums(found, window_px, spacing))
+    return solved(window_sums(found, window_px, spacing)(found))
 
 
-def solved(texture: Tensor, z: Tensor, pull: Tensor, window: SeparableFilter) -> Step:
-    """The step in a window, of what each pixel adds: to A and to z z^T, (B, 3, H, W) each, and to -b, (B, 2, H, W)."""
-    # The sum under w^2 is about half of that under w.
-    sums = window(torch.cat([texture, z / 2, pull], dim=1))
+def solved(sums: Tensor) -> Step:
+    """The step of `evidence` that a window has summed."""
+    if sums.is_cuda:
+        from gelflow.models import fused_registration as fused
+
+        return Step(*fused.solved(sums, MAX_VARIANCE).split([2, 1, 1], dim=1))
     xx, xy, yy, one, two, three, right, left = sums.split(1, dim=1)
     determinant, trace = xx * yy - xy.square(), xx + yy
     variance = one * (yy.square() + xy.square()) - 2 * two * xy * trace + three * (xx.square() + xy.square())
-    variance = variance / determinant.square()
+    # The sum under w^2 is about half of that under w.
+    variance = variance / (2 * determinant.square())
     # Terms that cancel leave rounding errors of either sign where there is nothing to see.
     enough = (determinant > 0) & (trace > 0) & (variance >= 0) & (variance < MAX_VARIANCE)
     step = torch.cat([xy * left - yy * right, xy * right - xx * left], dim=1) / determinant

@@ -106,9 +106,17 @@ class GelFlow(nn.Module):
         """The flow of one scale from its features (B, C, H, W) and the enlarged flow of the coarser one."""
         place = scale - FINEST_SCALE
         network = 0 if self.config.estimator == "shared" else place
-        costs = local_correlation(*normalised(first.float(), warp(second, start)), CORRELATION_RADIUS)
+        if start.is_cuda and not torch.is_grad_enabled():
+            from gelflow.models import fused_network as fused
+
+            both = fused.side_by_side(first, second, start)
+            spread, mean = torch.var_mean(both.view(2, len(start), -1), dim=(0, 2), unbiased=False)
+            costs = fused.costs(both, mean, spread + 1e-6, CORRELATION_RADIUS, layers.SLOPE)
+        else:
+            costs = local_correlation(*normalised(first.float(), warp(second, start)), CORRELATION_RADIUS)
+            costs = F.leaky_relu(costs, layers.SLOPE)
         projected = self.projections[place](first)
-        evidence = torch.cat([F.leaky_relu(costs, layers.SLOPE), projected, start], dim=1)
+        evidence = torch.cat([costs, projected, start], dim=1)
         context, correction = self.estimators[network](evidence)
         coarse = start + correction.float()
         refined = coarse + self.contexts[network](context, coarse).float()

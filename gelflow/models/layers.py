@@ -137,6 +137,10 @@ class LocalFlowFusion(nn.Module):
     def forward(self, flow: Flow, context: Features) -> Flow:
         """Fuses a flow (B, 2, H, W) by the context (B, C, H, W)."""
         batch, _, height, width = flow.shape
+        if flow.is_cuda and not torch.is_grad_enabled():
+            from gelflow.models import fused_network as fused
+
+            return fused.locally_fused(flow, context, 1 / math.sqrt(context.shape[1]) if self.scale == "inverse_sqrt" else 1.0)
         neighbours = F.unfold(flow, 3, padding=1).view(batch, 2, 9, height, width)
         return (neighbours * self.weights(context).unsqueeze(1)).sum(dim=2)
 
@@ -164,8 +168,16 @@ class RefinementHead(nn.Module):
         """
         # Unit length: a correlation near one says "here", whatever the contrast.
         first, second = F.normalize(encoded.float(), dim=1).split(flow.shape[0])
+        none = first.new_zeros(len(first))
         for _ in range(REFINEMENTS):
-            costs = encoded.shape[1] * local_correlation(first, warp(second, flow), REFINEMENT_RADIUS)
-            evidence = torch.cat([F.leaky_relu(costs, SLOPE), first, flow], dim=1)
+            if flow.is_cuda and not torch.is_grad_enabled():
+                from gelflow.models import fused_network as fused
+
+                both = fused.side_by_side(first, second, flow)
+                costs = fused.costs(both, none, none + 1 / first.shape[1], REFINEMENT_RADIUS, SLOPE)
+            else:
+                costs = first.shape[1] * local_correlation(first, warp(second, flow), REFINEMENT_RADIUS)
+                costs = F.leaky_relu(costs, SLOPE)
+            evidence = torch.cat([costs, first, flow], dim=1)
             flow = flow + self.head(self.layers(evidence)).float()
         return flow

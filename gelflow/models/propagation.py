@@ -63,8 +63,7 @@ def propagated(flow: Flow, image1: Images, image2: Images, window_px: float, con
 
     def residuals(candidates: Tensor) -> Tensor:
         """E of (N, B, 2, H, W): (N, B, 1, H, W)."""
-        images1, images2 = (image.expand(len(candidates), *image.shape).flatten(0, 1) for image in (first, second))
-        left = windowed_residual(candidates.flatten(0, 1), images1, images2, window, ignore_shading)
+        left = windowed_residual(candidates.flatten(0, 1), first, second, window, ignore_shading)
         return left.unflatten(0, (len(candidates), -1))
 
     now = residuals(start.unsqueeze(0))[0]
@@ -92,7 +91,13 @@ def propagated(flow: Flow, image1: Images, image2: Images, window_px: float, con
 def windowed_residual(
     flow: Flow, image1: Images, image2: Images, window: SeparableFilter, ignore_shading: bool
 ) -> Tensor:
-    """E at each pixel, (B, 1, H, W); infinite where too little of the window is in the image."""
+    """E at each pixel, (N, 1, H, W), of N flows of B pairs in turn; infinite where too little of a window is inside."""
+    whole = window(torch.ones_like(flow[:1, :1]))
+    if flow.is_cuda and ignore_shading:
+        from gelflow.models import fused_registration as fused
+
+        return fused.spread(window(fused.residual_terms(flow, image1, image2)), whole, MIN_SHARE_INSIDE)
+    image1, image2 = (image.repeat(len(flow) // len(image), 1, 1, 1) for image in (image1, image2))
     counts = inside(flow)
     left = counts * (warp(image2, flow) - image1)
     squares = left.square().mean(dim=1, keepdim=True)
@@ -101,7 +106,7 @@ def windowed_residual(
     spread = sums[:, 1:2] / weight
     if ignore_shading:
         spread = spread - (sums[:, 2:] / weight).square().mean(dim=1, keepdim=True)
-    return torch.where(weight > MIN_SHARE_INSIDE * window(torch.ones_like(counts[:1])), spread, torch.inf)
+    return torch.where(weight > MIN_SHARE_INSIDE * whole, spread, torch.inf)
 
 
 class _Proposals:

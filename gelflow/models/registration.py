@@ -111,7 +111,12 @@ def _stage(
     sample = second.near if spacing > 1 else second.at
     for _ in range(config.iterations):
         sums = window(moments(to_pixels(found), first, sample, config.background_px))
-        found = found + _posterior(sums, found - start, config).clamp(-MAX_STEP_PX, MAX_STEP_PX)
+        if found.is_cuda:
+            from gelflow.models import fused_registration as fused
+
+            found = fused.posterior(sums, found, start, config.noise, config.prior_px, MAX_STEP_PX)
+        else:
+            found = found + _posterior(sums, found - start, config).clamp(-MAX_STEP_PX, MAX_STEP_PX)
     return found
 
 
