@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from gelflow.arrays import FlowArray, ImageArray
+from gelflow.arrays import Flow, FlowArray, ImageArray, Images
 from gelflow.config import REGISTRATIONS, Registration
 from gelflow.errors import InputError
 from gelflow.files.image import check_images
@@ -14,9 +14,9 @@ from gelflow.hardware import chosen_device
 from gelflow.methods.fast import Fast, fast, is_fast
 from gelflow.methods.method import as_array, as_tensor
 from gelflow.methods.name import MethodName
-from gelflow.models.estimate import estimate_flow
+from gelflow.models.estimate import estimate_flow, flows_at
 from gelflow.models.raft import load_raft, looks_like_raft
-from gelflow.models.recorded import RecordedNetwork
+from gelflow.models.recorded import Recorder
 from gelflow.models.weights import load_weights
 from gelflow.ops.pyramid import resize_flow, resize_images
 
@@ -55,7 +55,7 @@ class Learned:
         registration: One of `gelflow.config.REGISTRATIONS`; None: what the weights' training asked for.
 
     Attributes:
-        forward: What `flow` costs beside reading and resizing, of tensors (B, 3, H, W) on the device.
+        run: Calls what is computed on the device, and records it on a CUDA device.
         trained: The architecture as the file has it, its own registration included.
 
     Raises:
@@ -81,7 +81,7 @@ class Learned:
         self.trained = self.model.config
         if registration is not None:
             self.model.config = self.trained.model_copy(update={"registration": REGISTRATIONS[registration]})
-        self.forward = RecordedNetwork(self.model)
+        self.run = Recorder()
         name = name or MethodName.parse("/".join(path.with_suffix("").parts[-2:]))
         known = (aim for aim, config in REGISTRATIONS.items() if config == self.model.config.registration)
         aim = next(known, "registration")
@@ -93,7 +93,11 @@ class Learned:
         """See `Method.flow`."""
         check_images(image1, image2)
         tensors = [as_tensor(image, self.device) for image in (image1, image2)]
-        return as_array(estimate_flow(self.model, tensors[0], tensors[1], self.size, self.forward))
+        return as_array(estimate_flow(self.model, tensors[0], tensors[1], self.size, self.run))
+
+    def forward(self, image1: Images, image2: Images) -> Flow:
+        """What `flow` costs beside reading and resizing, of tensors (B, 3, H, W) on the device."""
+        return self.run(flows_at, self.model, ((image1.shape[-2], image1.shape[-1]),), image1, image2)[0]
 
 
 class PublishedRaft:

@@ -1,6 +1,7 @@
 """Flow between images of any size by a trained network: resize, estimate, resize the flow back."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,21 +21,20 @@ DIFFERENT = 0.1
 taken dots for their neighbours, which sigma does not tell. Then the flow that closes on more of the picture is kept."""
 
 
+Run = Callable[..., tuple[Tensor, ...]]
+"""Calls a function with arguments, such as `gelflow.models.recorded.Recorder`."""
+
+
 def estimate_flow(
-    model: GelFlow,
-    image1: Images,
-    image2: Images,
-    size: tuple[int, int] | None = None,
-    flow: Callable[[Images, Images], Flow] | None = None,
+    model: GelFlow, image1: Images, image2: Images, size: tuple[int, int] | None = None, run: Run | None = None
 ) -> Flow:
     """The flow from image 1 to image 2: ``I1(x) = I2(x + V(x))``, (B, 2, H, W) float32, px of the images, no gradient.
 
     Images are (B, 3, H, W) float32 in [0, 1]. The network is used on the device that it is on, in evaluation mode, and
     left as it was. `size` is the rows and columns at which it works, by default `GelFlow.image_size`. Where that is
     None, all of `working_sizes` are tried, and each pair keeps the flow with the least mean of sigma or, where they
-    differ much (DIFFERENT), the one that closes best. `flow` is called in place of `GelFlow.flow`, such as a
-    `RecordedNetwork` of the model. InputError for shapes that differ, sides of `size` below 64 px or, without one, of
-    the images below 16 px, other than three colours, values that are not finite.
+    differ much (DIFFERENT), the one that closes best. InputError for shapes that differ, sides of `size` below 64 px
+    or, without one, of the images below 16 px, other than three colours, values that are not finite.
     """
     size = size or model.image_size
     if size is not None and min(size) < MINIMUM_SIDE:
@@ -43,35 +43,46 @@ def estimate_flow(
     for name, image in (("image 1", image1), ("image 2", image2)):
         if not torch.isfinite(image).all():
             raise InputError(f"{name} holds NaN or infinite values; images must be finite, in [0, 1]")
-    device = next(model.parameters()).device
-    native = (image1.shape[-2], image1.shape[-1])
+    device, run = next(model.parameters()).device, run or _call
     first, second = (image.to(device, torch.float32) for image in (image1, image2))
-    sizes = working_sizes(*native) if size is None else [size]
+    sizes = tuple(working_sizes(image1.shape[-2], image1.shape[-1]) if size is None else [size])
     was_training = model.training
     model.eval()
-
-    def flows(one: Images, other: Images) -> list[Flow]:
-        """The flow from one image to the other at each size."""
-        reduced = ((resize_images(one, size), resize_images(other, size)) for size in sizes)
-        return [resize_flow((flow or model.flow)(*images), native) for images in reduced]
-
     try:
         with torch.no_grad():
-            found = flows(first, second)
-            best = found[0]
-            if len(found) > 1:
-                sigmas = [sized_sigma(each, first, second, size)[0] for each, size in zip(found, sizes, strict=True)]
-                chosen = torch.stack(sigmas).mean(dim=(2, 3, 4)).argmin(dim=0)
-                differ = _share_beyond(found[0] - found[1]) > DIFFERENT
+            if len(sizes) == 1:
+                best = run(flows_at, model, sizes, first, second)[0]
+            else:
+                *found, chosen, differ = run(_surest, model, sizes, first, second)
                 if differ.any():
+                    backward = run(flows_at, model, sizes, second, first)
                     missed = [
-                        there + warp(back, there) for there, back in zip(found, flows(second, first), strict=True)
+                        _share_beyond(there + warp(back, there)) for there, back in zip(found, backward, strict=True)
                     ]
-                    chosen = torch.where(differ, torch.stack(list(map(_share_beyond, missed))).argmin(dim=0), chosen)
-                best = torch.stack(found)[chosen, torch.arange(len(best))]
+                    chosen = torch.where(differ, torch.stack(missed).argmin(dim=0), chosen)
+                best = torch.stack(found)[chosen, torch.arange(len(chosen), device=device)]
     finally:
         model.train(was_training)
     return best.to(image1.device)
+
+
+def _call(function: Run, *arguments: Any) -> tuple[Tensor, ...]:
+    return function(*arguments)
+
+
+def flows_at(model: GelFlow, sizes: Sequence[tuple[int, int]], image1: Images, image2: Images) -> tuple[Flow, ...]:
+    """The flow at each size, px of the images as they are given."""
+    native = (image1.shape[-2], image1.shape[-1])
+    reduced = ((resize_images(image1, size), resize_images(image2, size)) for size in sizes)
+    return tuple(resize_flow(model.flow(*images), native) for images in reduced)
+
+
+def _surest(model: GelFlow, sizes: Sequence[tuple[int, int]], image1: Images, image2: Images) -> tuple[Tensor, ...]:
+    """The flow at each of two sizes; per pair, which one has the least mean of sigma, and whether they differ much."""
+    flows = flows_at(model, sizes, image1, image2)
+    sigmas = [sized_sigma(each, image1, image2, size)[0] for each, size in zip(flows, sizes, strict=True)]
+    chosen = torch.stack(sigmas).mean(dim=(2, 3, 4)).argmin(dim=0)
+    return *flows, chosen, _share_beyond(flows[0] - flows[1]) > DIFFERENT
 
 
 def _share_beyond(difference: Flow) -> Tensor:

@@ -32,11 +32,16 @@ def costs(both: Tensor, mean: Tensor, variance: Tensor, radius: int, slope: floa
 
 @wp.kernel
 def _costs(
-    both: Field, mean: wp.array(dtype=wp.float32), variance: wp.array(dtype=wp.float32), r: int, slope: float, out: Field
+    both: Field,
+    mean: wp.array(dtype=wp.float32),
+    variance: wp.array(dtype=wp.float32),
+    r: int,
+    slope: float,
+    out: Field,
 ):
     b, d, y, x = wp.tid()
     row, column = y + d // (2 * r + 1) - r, x + d % (2 * r + 1) - r
-    total = float(0.0)
+    total = wp.float32(0.0)
     if row >= 0 and row < both.shape[2] and column >= 0 and column < both.shape[3]:
         for c in range(both.shape[1]):
             total += (both[b, c, y, x] - mean[b]) * (both[b + out.shape[0], c, row, column] - mean[b])
@@ -52,11 +57,11 @@ def locally_fused(flow: Flow, context: Features, share: float) -> Flow:
 @wp.kernel
 def _locally_fused(flow: Field, context: Field, share: float, out: Field):
     b, y, x = wp.tid()
-    most, total, u, v = float(-wp.inf), float(0.0), float(0.0), float(0.0)
+    most, total, u, v = wp.float32(-wp.inf), wp.float32(0.0), wp.float32(0.0), wp.float32(0.0)
     for i in range(9):
         row, column = y + i // 3 - 1, x + i % 3 - 1
         if row >= 0 and row < flow.shape[2] and column >= 0 and column < flow.shape[3]:
-            similarity = float(0.0)
+            similarity = wp.float32(0.0)
             for c in range(context.shape[1]):
                 similarity += context[b, c, y, x] * context[b, c, row, column]
             similarity *= share

@@ -36,7 +36,7 @@ def _local_mean(sums: Field, b: int, c: int, y: int, x: int):
     """The mean that windows at every second pixel hold of channel c, at a pixel; their weight is the last channel."""
     column, row = wp.max(float(x) / 2.0 - 0.25, 0.0), wp.max(float(y) / 2.0 - 0.25, 0.0)
     left, top, last = int(column), int(row), sums.shape[1] - 1
-    mean = float(0.0)
+    mean = wp.float32(0.0)
     for i in range(2):
         for j in range(2):
             m, n = wp.min(top + i, sums.shape[2] - 1), wp.min(left + j, sums.shape[3] - 1)
@@ -173,7 +173,7 @@ def residual_terms(flow: Flow, image1: Images, image2: Images) -> Tensor:
 def _residual_terms(flow: Field, image1: Field, image2: Field, out: Field):
     b, y, x = wp.tid()
     counts, colours, pair = is_inside(flow, b, y, x), image1.shape[1], b % image1.shape[0]
-    square = float(0.0)
+    square = wp.float32(0.0)
     for c in range(colours):
         there = bilinear(image2, pair, c, float(x) + flow[b, 0, y, x], float(y) + flow[b, 1, y, x])
         r = there - image1[pair, c, y, x]
@@ -192,7 +192,7 @@ def spread(sums: Tensor, whole: Tensor, share: float) -> Tensor:
 def _spread(sums: Field, whole: Field, share: float, out: Field):
     b, y, x = wp.tid()
     weight, colours = sums[b, 0, y, x], sums.shape[1] - 2
-    square = float(0.0)
+    square = wp.float32(0.0)
     for c in range(colours):
         mean = sums[b, 2 + c, y, x] / weight
         square += mean * mean / float(colours)

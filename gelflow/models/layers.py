@@ -140,7 +140,9 @@ class LocalFlowFusion(nn.Module):
         if flow.is_cuda and not torch.is_grad_enabled():
             from gelflow.models import fused_network as fused
 
-            return fused.locally_fused(flow, context, 1 / math.sqrt(context.shape[1]) if self.scale == "inverse_sqrt" else 1.0)
+            return fused.locally_fused(
+                flow, context, 1 / math.sqrt(context.shape[1]) if self.scale == "inverse_sqrt" else 1.0
+            )
         neighbours = F.unfold(flow, 3, padding=1).view(batch, 2, 9, height, width)
         return (neighbours * self.weights(context).unsqueeze(1)).sum(dim=2)
 

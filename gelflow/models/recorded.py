@@ -1,11 +1,12 @@
 """The network as a CUDA graph: launching its kernels one by one takes longer than they do.
 
-In use (`RecordedNetwork`), registration included, one launch a pair stands for a thousand. In training
+In use (`Recorder`), registration included, one launch a pair stands for a thousand. In training
 (`GraphedNetwork`), `torch.cuda.make_graphed_callables` records forward and backward pass for one shape of images, and
 one launch a step stands for five thousand. That recording owns the memory of what it keeps for the backward pass, so
 between two backward passes it may be called only once.
 """
 
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -14,57 +15,59 @@ from torch import Tensor, nn
 from gelflow.arrays import Flow, Images
 from gelflow.models.gelflow import GelFlow
 
+MOST = 4
+"""Recordings that a `Recorder` remembers: flow and, for the closure, flow backward, at two shapes."""
 
-class RecordedNetwork:
-    """A network whose pass over CUDA images is recorded when a shape comes a second time, and replayed from then on.
 
-    Two shapes are remembered, those of `gelflow.models.working_size`. The network has to be in evaluation mode when it
-    is called.
+class Recorder:
+    """Calls functions of CUDA tensors, and records what they do when shapes come a second time, to replay it.
 
-    Without gradient; on a CPU, and for images of ever other shapes, the network as it is. Its weights may change in
-    place, not move.
+    `MOST` calls are remembered, told apart by function, shapes, and arguments that are no tensors. Networks have to be
+    in evaluation mode; their weights may change in place, not move. Without gradient; a call whose tensors are not all
+    on a CUDA device, and one with ever other shapes, is made as it is.
     """
 
-    def __init__(self, model: GelFlow) -> None:
-        self.model = model
-        self._recordings: dict[torch.Size, _Recording | None] = {}
+    def __init__(self) -> None:
+        self._recordings: dict[tuple[Any, ...], _Recording | None] = {}
 
     @torch.no_grad()
-    def __call__(self, image1: Images, image2: Images) -> Flow:
-        """Estimates the flow; arguments and exceptions as for `GelFlow.flow`."""
-        shape = image1.shape
-        if not image1.is_cuda or shape != image2.shape:
-            return self.model.flow(image1, image2)
-        if shape not in self._recordings:
-            if len(self._recordings) == 2:
+    def __call__(self, function: Callable[..., tuple[Tensor, ...]], *arguments: Any) -> tuple[Tensor, ...]:
+        """What the function, which waits for nothing and returns tensors, gives for these arguments."""
+        tensors = [each for each in arguments if isinstance(each, Tensor)]
+        if not all(each.is_cuda for each in tensors):
+            return function(*arguments)
+        key = (function, *(each.shape if isinstance(each, Tensor) else each for each in arguments))
+        if key not in self._recordings:
+            if len(self._recordings) == MOST:
                 self._recordings.clear()
-            self._recordings[shape] = None
-            return self.model.flow(image1, image2)
-        recording = self._recordings[shape] or self._record(image1, image2)
-        for kept, new in zip(recording.images, (image1, image2), strict=True):
+            self._recordings[key] = None
+            return function(*arguments)
+        recording = self._recordings[key] = self._recordings[key] or _recorded(function, arguments)
+        for kept, new in zip(recording.tensors, tensors, strict=True):
             kept.copy_(new)
         recording.graph.replay()
-        return recording.flow.clone()
-
-    def _record(self, image1: Images, image2: Images) -> "_Recording":
-        images = [image1.clone(), image2.clone()]
-        # Once more on a stream of its own, as recording asks for, so that libraries have chosen their kernels.
-        aside = torch.cuda.Stream(image1.device)
-        aside.wait_stream(torch.cuda.current_stream(image1.device))
-        with torch.cuda.stream(aside):
-            self.model.flow(*images)
-        torch.cuda.current_stream(image1.device).wait_stream(aside)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            flow = self.model.flow(*images)
-        self._recordings[image1.shape] = recording = _Recording(graph, images, flow)
-        return recording
+        return tuple(each.clone() for each in recording.results)
 
 
 class _Recording(NamedTuple):
     graph: torch.cuda.CUDAGraph
-    images: list[Tensor]
-    flow: Flow
+    tensors: list[Tensor]
+    results: tuple[Tensor, ...]
+
+
+def _recorded(function: Callable[..., tuple[Tensor, ...]], arguments: Sequence[Any]) -> _Recording:
+    kept = [each.clone() if isinstance(each, Tensor) else each for each in arguments]
+    tensors = [each for each in kept if isinstance(each, Tensor)]
+    here, aside = torch.cuda.current_stream(tensors[0].device), torch.cuda.Stream(tensors[0].device)
+    # Once more on a stream of its own, as recording asks for, so that libraries have chosen their kernels.
+    aside.wait_stream(here)
+    with torch.cuda.stream(aside):
+        function(*kept)
+    here.wait_stream(aside)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        results = function(*kept)
+    return _Recording(graph, tensors, results)
 
 
 class GraphedNetwork:

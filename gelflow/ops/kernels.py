@@ -4,6 +4,7 @@ Warp compiles them, without a compiler on the user's machine, when one is first 
 functions that compute on such a device load it. The kernels themselves run on processors, too.
 """
 
+import functools
 from typing import Any
 
 import torch
@@ -26,9 +27,12 @@ def launch(kernel: Any, out: Tensor, *inputs: Tensor | float, by_channel: bool =
     batch, channels, height, width = out.shape
     threads = (batch, channels, height, width) if by_channel else (batch, height, width)
     arrays = [wp.from_torch(each) if isinstance(each, Tensor) else each for each in (*inputs, out)]
-    stream = wp.stream_from_torch(torch.cuda.current_stream(out.device)) if out.is_cuda else None
+    stream = _stream(torch.cuda.current_stream(out.device)) if out.device.type == "cuda" else None
     wp.launch(kernel, threads, arrays, device=wp.device_from_torch(out.device), stream=stream)
     return out
+
+
+_stream = functools.cache(wp.stream_from_torch)
 
 
 @wp.func

@@ -76,9 +76,8 @@ class FlowModel:
                 arrays = zip(*(image.movedim(1, -1).float().cpu().numpy() for image in (first, second)), strict=True)
                 flows = [self._network.flow(factor * one, factor * other) for one, other in arrays]
                 return torch.from_numpy(np.stack(flows)).movedim(-1, 1).to(image1.device)
-            return estimate_flow(
-                self._network.model, factor * first, factor * second, self._network.size, self._network.forward
-            )
+            network = self._network
+            return estimate_flow(network.model, factor * first, factor * second, network.size, network.run)
         if isinstance(image1, np.ndarray) and isinstance(image2, np.ndarray):
             if image1.ndim == image2.ndim == 4:
                 return np.stack([self.flow(*each) for each in _pairs(image1, image2)])

@@ -39,7 +39,7 @@ def test_large_images_are_worked_on_at_two_sizes(given: tuple[int, int], sizes: 
     assert working_sizes(*given) == sizes
 
 
-def test_a_fine_pattern_keeps_its_size_and_each_pair_of_a_batch_has_its_own() -> None:
+def test_a_fine_pattern_keeps_its_size_and_each_pair_of_a_batch_has_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of noise whose detail is lost at half the size, and of wide dots."""
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     pairs = [(cv2.GaussianBlur(noise, (0, 0), 1.0), 2), (dots(480, 640, 60.0), 3)]
@@ -54,19 +54,22 @@ def test_a_fine_pattern_keeps_its_size_and_each_pair_of_a_batch_has_its_own() ->
         wrong = 0.5 * (torch.tensor([1, 0]) if len(sizes) == 2 else torch.tensor([0, 1])).view(2, 1, 1, 1)
         return torch.cat([shift + wrong, 0 * shift], dim=1).expand(2, 2, *image1.shape[-2:])
 
-    found = estimate_flow(network, first, second, flow=flow)
+    monkeypatch.setattr(network, "flow", flow)
+    found = estimate_flow(network, first, second)
     assert sizes == [(480, 640), (240, 320)]
     np.testing.assert_allclose(found[:, 0, 240, 320], [2.0, 3.0], atol=1e-3)
 
 
-def test_where_the_two_flows_differ_much_the_one_that_closes_is_kept() -> None:
+def test_where_the_two_flows_differ_much_the_one_that_closes_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """A jump by 20 px in both directions, on images that do not tell."""
     still = torch.zeros(1, 3, 480, 640)
 
     def flow(image1: Images, image2: Images) -> Flow:
         return torch.full((1, 2, *image1.shape[-2:]), 20.0 if image1.shape[-1] == 640 else 0.0)
 
-    assert not estimate_flow(load_weights(weights_file(None)), still, still, flow=flow).any()
+    network = load_weights(weights_file(None))
+    monkeypatch.setattr(network, "flow", flow)
+    assert not estimate_flow(network, still, still).any()
 
 
 def test_flow_and_sigma_of_an_enlarged_pair_are_those_of_the_pair_enlarged() -> None:

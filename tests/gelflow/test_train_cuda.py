@@ -9,7 +9,8 @@ from waves import Shifts
 
 from gelflow.config import REGISTRATIONS, LossConfig, ModelConfig, Registration, TrainConfig
 from gelflow.models import GelFlow
-from gelflow.models.recorded import GraphedNetwork, RecordedNetwork
+from gelflow.models.estimate import flows_at
+from gelflow.models.recorded import GraphedNetwork, Recorder
 from gelflow.models.registration import registered
 from gelflow.models.weights import load_weights
 from gelflow.ops.correlation import local_correlation
@@ -61,12 +62,13 @@ def test_recorded_passes_are_the_networks_own(half: bool, close: float) -> None:
 def test_a_network_in_use_is_recorded_for_each_shape(aim: Registration) -> None:
     torch.manual_seed(0)
     model = GelFlow(SMALL.model_copy(update={"registration": REGISTRATIONS[aim]})).cuda().eval()
-    recorded = RecordedNetwork(model)
+    run = Recorder()
     # The second and third call with a shape replay.
     for seed, side in enumerate([96, 96, 96, 64, 96, 96]):
         pair = shifted(seed, side)
-        found = recorded(*pair)
-        recorded(*shifted(seed + 20, side))
+        sizes = ((side, side),)
+        (found,) = run(flows_at, model, sizes, *pair)
+        run(flows_at, model, sizes, *shifted(seed + 20, side))
         with torch.no_grad():
             expected = model.flow(*pair)
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
