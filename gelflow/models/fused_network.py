@@ -8,6 +8,19 @@ from gelflow.arrays import Features, Flow
 from gelflow.ops.kernels import Field, bilinear, launch
 
 
+def add_bias(found: Features, bias: Tensor, slope: float) -> Features:
+    """What a convolution found (B, C, H, W), changed to the leaky ReLU of its sum with the bias (C,)."""
+    launch(_add_bias, found.permute(0, 2, 3, 1), bias, slope, by_channel=True)  # channels lie side by side
+    return found
+
+
+@wp.kernel
+def _add_bias(bias: wp.array(dtype=wp.float32), slope: float, out: Field):
+    b, y, x, c = wp.tid()
+    found = out[b, y, x, c] + bias[c]
+    out[b, y, x, c] = wp.where(found < 0.0, slope * found, found)
+
+
 def side_by_side(first: Features, second: Features, flow: Flow) -> Tensor:
     """The features of image 1 and those of image 2 warped by a flow, (2 B, C, H, W)."""
     out = flow.new_empty(2 * len(first), *first.shape[1:])

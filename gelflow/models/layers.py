@@ -31,7 +31,20 @@ def convolution(inputs: int, outputs: int, *, side: int = 3, stride: int = 1, di
     layer = nn.Conv2d(inputs, outputs, side, stride=stride, padding=side // 2 * dilation, dilation=dilation)
     nn.init.kaiming_normal_(layer.weight, a=SLOPE)
     nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
-    return nn.Sequential(layer, nn.LeakyReLU(SLOPE, inplace=True))
+    return Convolution(layer, nn.LeakyReLU(SLOPE, inplace=True))
+
+
+class Convolution(nn.Sequential):
+    """A convolution and its leaky ReLU."""
+
+    def forward(self, features: Features) -> Features:
+        layer = self[0]
+        if not features.is_cuda or torch.is_grad_enabled() or torch.is_autocast_enabled("cuda"):
+            return super().forward(features)
+        from gelflow.models import fused_network as fused
+
+        found = F.conv2d(features, layer.weight, None, layer.stride, layer.padding, layer.dilation)
+        return fused.add_bias(found, layer.bias, SLOPE)
 
 
 def flow_head(inputs: int) -> nn.Conv2d:

@@ -97,7 +97,7 @@ def windowed_residual(
         from gelflow.models import fused_registration as fused
 
         return fused.spread(window(fused.residual_terms(flow, image1, image2)), whole, MIN_SHARE_INSIDE)
-    image1, image2 = (image.repeat(len(flow) // len(image), 1, 1, 1) for image in (image1, image2))
+    image1, image2 = (i.expand(len(flow) // len(i), *i.shape).flatten(0, 1) for i in (image1, image2))
     counts = inside(flow)
     left = counts * (warp(image2, flow) - image1)
     squares = left.square().mean(dim=1, keepdim=True)

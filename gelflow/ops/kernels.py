@@ -52,3 +52,17 @@ def bilinear(image: Field, b: int, c: int, column: float, row: float):
     above = wp.lerp(image[b, c, top, left], image[b, c, top, right], x - float(left))
     below = wp.lerp(image[b, c, bottom, left], image[b, c, bottom, right], x - float(left))
     return wp.lerp(above, below, y - float(top))
+
+
+def sampled(image: Tensor, places: Tensor, scale: float) -> Tensor:
+    """An image (B, C, s H, s W) with `scale` s px for one of the places (B, 2, H', W'), bilinear: (B, C, H', W')."""
+    out = image.new_empty(*image.shape[:2], *places.shape[2:])
+    return launch(_sampled, out, image, places, scale)
+
+
+@wp.kernel
+def _sampled(image: Field, places: Field, scale: float, out: Field):
+    b, y, x = wp.tid()
+    column, row = scale * (places[b, 0, y, x] + 0.5) - 0.5, scale * (places[b, 1, y, x] + 0.5) - 0.5
+    for c in range(image.shape[1]):
+        out[b, c, y, x] = bilinear(image, b, c, column, row)
