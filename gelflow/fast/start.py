@@ -20,11 +20,12 @@ import torch
 
 from gelflow.arrays import FlowArray, Grey8, ImageArray
 from gelflow.fast.registration import CONFIG, STAGES, Prepared, register, resized, unexplained
+from gelflow.models import GelFlow
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.weights import load_weights, weights_file
 
-Network = Callable[[ImageArray, ImageArray], FlowArray]
-"""Gives the flow between two images of one size; `gelflow.methods.method.Method.flow`."""
+Network = Callable[[ImageArray, ImageArray], FlowArray | None]
+"""Gives the flow between two images of one size, as `gelflow.methods.method.Method.flow`; None: it will come later."""
 CHOICE_WINDOW_PX = 25.0
 """Standard deviation of the window in which starts are compared."""
 MIN_GAIN = 0.95
@@ -53,8 +54,8 @@ def fresh_start(
         medium = register(dis("medium", first.grey, second.grey), first, second, widest)
         flow = best_of([flow, medium], first, second)
     left = torn(flow, first, second)
-    if MOST_TORN < left < UNRELATED:
-        asked = register((network or _shipped())(first.whole, second.whole), first, second, widest)
+    if MOST_TORN < left < UNRELATED and (found := (network or shipped)(first.whole, second.whole)) is not None:
+        asked = register(found, first, second, widest)
         flow = asked if torn(asked, first, second) < left else flow
     return flow
 
@@ -65,16 +66,17 @@ def torn(flow: FlowArray, first: Prepared, second: Prepared) -> float:
     return float(((share > TORN) & (square > CONFIG.noise**2)).mean())
 
 
+def shipped(image1: ImageArray, image2: ImageArray) -> FlowArray:
+    """The flow of the shipped network, without its registration; it is loaded at the first call."""
+    one, other = (torch.from_numpy(image).movedim(-1, 0).contiguous()[None] for image in (image1, image2))
+    return np.ascontiguousarray(estimate_flow(_shipped_network(), one, other)[0].movedim(0, -1).numpy())
+
+
 @functools.cache
-def _shipped() -> Network:
-    model = load_weights(weights_file(None))
-    model.config = model.config.model_copy(update={"registration": None})
-
-    def flow(image1: ImageArray, image2: ImageArray) -> FlowArray:
-        one, other = (torch.from_numpy(image).movedim(-1, 0).contiguous()[None] for image in (image1, image2))
-        return np.ascontiguousarray(estimate_flow(model, one, other)[0].movedim(0, -1).numpy())
-
-    return flow
+def _shipped_network() -> GelFlow:
+    network = load_weights(weights_file(None))
+    network.config = network.config.model_copy(update={"registration": None})
+    return network
 
 
 def best_of(flows: Sequence[FlowArray], first: Prepared, second: Prepared) -> FlowArray:

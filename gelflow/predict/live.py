@@ -60,7 +60,7 @@ def follow(
                 yield index, time_s, frame
 
         for (index, time_s, frame), (found, seconds, moved) in followed(
-            method, noted(), lambda _: source, reference, markers, places
+            method, noted(), lambda _: source, reference, markers, places, wait=False
         ):
             latency_s = time.monotonic() - arrivals[-1][1]
             left_out = index - arrivals[0][0] - 1

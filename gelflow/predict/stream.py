@@ -29,15 +29,15 @@ class Stream:
     """The flow of a method from the first frame, or from the previous one, to each next frame.
 
     The method "fast" tracks (`gelflow.track.tracker`) from the first frame; others see each frame on its own. Markers
-    are those of the first frame; InputError where the flow does not come from there.
+    are those of the first frame; InputError where the flow does not come from there. `wait` is as of `Tracker`.
     """
 
-    def __init__(self, method: Method, first: Frame, reference: Reference, markers: bool) -> None:
+    def __init__(self, method: Method, first: Frame, reference: Reference, markers: bool, wait: bool = True) -> None:
         if markers and reference == "previous":
             raise InputError("--markers: they are followed from the first frame; leave out --reference previous")
         self._method, self._before, self._reference, self._with_markers = method, first, reference, markers
         image = in_unit_range(first)
-        self._tracker = Tracker(image) if isinstance(method, Fast) and reference == "first" else None
+        self._tracker = Tracker(image, wait=wait) if isinstance(method, Fast) and reference == "first" else None
         self._markers = Markers(full_range(image, image)[0]) if markers and self._tracker is None else None
 
     def update(self, frame: Frame) -> Followed:
@@ -66,6 +66,7 @@ def followed(
     reference: Reference = "first",
     markers: bool = False,
     places: FlowArray | None = None,
+    wait: bool = True,
 ) -> Iterator[tuple[Indexed, Followed]]:
     """Yields each frame but the first with what was found in it.
 
@@ -80,7 +81,7 @@ def followed(
                 size = f"{places.shape[1]}x{places.shape[0]}"
                 raise InputError(f"--scene: it has {size} px, the frame {frame.shape[1]}x{frame.shape[0]}")
             if stream is None:
-                stream = Stream(method, frame, reference, markers)
+                stream = Stream(method, frame, reference, markers, wait)
                 continue
             found = stream.update(frame)
         except InputError as error:

@@ -8,8 +8,10 @@ reference, and a network if that tears, too (`gelflow.fast.start`). What they le
 frame in which most of the picture is lost, such as a cut or one of a ramp of exposure, the next one starts afresh.
 """
 
+import functools
 import math
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +23,7 @@ from gelflow.arrays import FlowArray, Frame, ImageArray, MapArray
 from gelflow.errors import InputError
 from gelflow.fast.certainty import Refined, refined
 from gelflow.fast.registration import STAGES, Prepared, indices, register, resized
-from gelflow.fast.start import MOST_TORN, dis, fresh_start
+from gelflow.fast.start import MOST_TORN, dis, fresh_start, shipped
 from gelflow.files.image import as_image, check_images, range_factor
 from gelflow.methods.fast import FAST, Fast
 from gelflow.methods.learned import open_network
@@ -63,6 +65,9 @@ class Tracker:
             float in [0, 1]; each side has 16 px or more. Larger images than 400 x 300 px are reduced.
         weights: The network that is asked where DIS, too, loses the stream: "fast", the shipped one without its
             registration; "best" or a file of weights, that one with what it comes with.
+        wait: Whether the frame in which the stream is lost waits for the network, for half a second or so. If not, the
+            network is asked on another thread. Until it answers, frames go on with what is known; sigma is 10 px where
+            the stream is lost.
         scene: None alone is allowed; motion and markers are in px.
 
     Raises:
@@ -75,11 +80,14 @@ class Tracker:
         (64, 80, 2)
     """
 
-    def __init__(self, reference: ImageArray | Frame, weights: str | Path = FAST, scene: None = None) -> None:
+    def __init__(
+        self, reference: ImageArray | Frame, weights: str | Path = FAST, scene: None = None, wait: bool = True
+    ) -> None:
         if scene is not None:
             raise InputError(f"scene = {scene!r}: millimetres are not known here; give None, and take px")
         method = open_network(weights_file(Path(weights)))
-        self._network = None if isinstance(method, Fast) else method.flow
+        self._network = shipped if isinstance(method, Fast) else method.flow
+        self._thread = None if wait else ThreadPoolExecutor(1)
         self.reset(reference)
 
     def reset(self, reference: ImageArray | Frame | None = None) -> None:
@@ -91,6 +99,7 @@ class Tracker:
             self._image = self._factor * image
             self._first, self._markers = Prepared(self._image), Markers(self._image)
         self._last: tuple[Prepared, Refined] | None = None
+        self._asked: tuple[Prepared, Future[FlowArray]] | None = None
         self._since, self._accepted = 0, 0.0
         self._time_s = -math.inf
 
@@ -127,17 +136,31 @@ class Tracker:
             flows.append(_moved_on(before, last.flow, second))
             found = refined(register(flows[0], self._first, second, TRACKING), self._first, second, last)
             self._accepted = min(self._accepted, found.torn)
-        if afresh or found.torn > (self._accepted if self._since < RETRY else 0.0) + MOST_TORN:
-            start = fresh_start(self._first, second, flows, self._network)
+        start = None
+        if self._asked is not None and self._asked[1].done():
+            (seen, answer), self._asked = self._asked, None
+            if found.torn > MOST_TORN:
+                start = register(_moved_on(seen, answer.result(), second), self._first, second, STAGES[:1])
+        elif afresh or found.torn > (self._accepted if self._since < RETRY else 0.0) + MOST_TORN:
+            start = fresh_start(self._first, second, flows, functools.partial(self._ask, second))
+        if start is not None:
             fresh = refined(register(start, self._first, second, STAGES[1:]), self._first, second)
             afresh = afresh or fresh.torn < CLEARLY_LESS * found.torn
             found = fresh if afresh else found
             self._since, self._accepted = 0, found.torn
         if found.lost.mean() > CUT:
-            self._last = None
+            self._last = self._asked = None
             return found._replace(sigma=np.full_like(found.sigma, MAX_SIGMA_PX)), True
         self._last = (second, found)
         return found, afresh
+
+    def _ask(self, second: Prepared, image1: ImageArray, image2: ImageArray) -> FlowArray | None:
+        """The network's flow to a frame; None where it will come later."""
+        if self._thread is None:
+            return self._network(image1, image2)
+        if self._asked is None:
+            self._asked = (second, self._thread.submit(self._network, image1, image2))
+        return None
 
 
 def _moved_on(before: Prepared, flow: FlowArray, second: Prepared) -> FlowArray:

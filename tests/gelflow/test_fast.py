@@ -51,7 +51,7 @@ def test_dots_taken_for_the_next_ones_are_seen_and_the_network_finds_them(larges
     found, off = model.estimate(image1, image2), error(model.flow(image1, image2), truth)
     assert (off > PITCH / 2).mean() < 1e-3
     assert np.median(found.sigma) < 0.5
-    monkeypatch.setattr(start, "_shipped", lambda: lambda one, _: asked.append(1) or 0 * one[..., :2])
+    monkeypatch.setattr(start, "shipped", lambda one, _: asked.append(1) or 0 * one[..., :2])
     found = model.estimate(image1, image2)
     wrong = np.hypot(*np.moveaxis(found.flow - truth, -1, 0)) > PITCH / 2
     assert asked
@@ -62,7 +62,7 @@ def test_dots_taken_for_the_next_ones_are_seen_and_the_network_finds_them(larges
 
 
 def test_no_network_is_asked_where_dots_move_little(monkeypatch) -> None:
-    monkeypatch.setattr(start, "_shipped", None)
+    monkeypatch.setattr(start, "shipped", None)
     image1, image2, truth = pressed_dots(6.0)
     found = gelflow.load_model("fast").estimate(image1, image2)
     assert (found.sigma < 1).all()

@@ -2,6 +2,7 @@
 
 import pickle
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import OpenEXR
@@ -14,7 +15,6 @@ from textures import as_bytes, moved, table, write_video
 import gelflow
 from gelflow.arrays import Estimate
 from gelflow.cli import main
-from gelflow.fast import start
 from gelflow.track.markers import Markers
 
 SIZE = (160, 208)
@@ -61,7 +61,7 @@ def test_after_a_cut_nothing_is_known_and_the_next_frame_is_found() -> None:
 
 
 def test_a_ramp_of_exposure_is_unknown_asks_no_network_and_the_stream_goes_on(monkeypatch) -> None:
-    monkeypatch.setattr(start, "_shipped", None)
+    monkeypatch.setattr("gelflow.track.tracker.shipped", None)
     tracker = gelflow.Tracker(frame())
     light = [1.0, 0.15, 0.03, 0.1, 0.9, 1.0, 1.0]
     found = []
@@ -192,6 +192,29 @@ def test_the_network_takes_over_where_the_stream_is_lost(monkeypatch) -> None:
     truth = motion.flow(*SIZE)
     wrong = np.hypot(*np.moveaxis(found.flow - truth, -1, 0)) > PITCH / 2
     assert wrong[found.sigma < 1].mean() < 0.01
+
+
+def test_frames_that_do_not_wait_go_on_and_the_networks_answer_is_moved_on(monkeypatch) -> None:
+    """The same turn; the network answers two frames later."""
+    tracker, lost, let = gelflow.Tracker(frame(), wait=False), Turn(14.0, shift=(2.0, 0.0)), Event()
+    flow = lost.flow(*SIZE).astype(np.float32)
+    monkeypatch.setattr(tracker, "_network", lambda *_: flow if let.wait(60) else None)
+    assert off(tracker.update(frame(shift=(1.0, 0.0))).flow, Turn(shift=(1.0, 0.0))) < 0.1
+
+    def wrong(motion: Turn) -> tuple[float, gelflow.track.tracker.Tracked]:
+        found = tracker.update(motion.frame(*SIZE, DOTS))
+        missed = np.hypot(*np.moveaxis(found.flow - motion.flow(*SIZE), -1, 0)) > PITCH / 2
+        assert missed[found.sigma < 1].mean() < 0.01
+        return float(missed.mean()), found
+
+    for motion in (lost, Turn(14.5, shift=(3.0, 0.0))):
+        assert wrong(motion)[0] > 0.02
+    let.set()
+    tracker._thread.shutdown()
+    share, found = wrong(Turn(15.0, shift=(4.0, 0.0)))
+    assert share < 0.001
+    assert found.afresh
+    assert wrong(Turn(15.5, shift=(5.0, 0.0)))[0] < 0.001
 
 
 @pytest.mark.parametrize("weights", [["--weights", "fast"], ["--method", "farneback"]])
