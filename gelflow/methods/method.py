@@ -30,7 +30,7 @@ class Method(Protocol):
 
 def as_tensor(image: ImageArray, device: str) -> Any:
     """An image or flow (H, W, C) float32 as a tensor (1, C, H, W) on a device."""
-    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(image, -1, 0)))[None].to(device)
+    return torch.from_numpy(np.ascontiguousarray(image)).to(device).movedim(-1, 0).contiguous()[None]
 
 
 def as_array(flow: Any) -> FlowArray:

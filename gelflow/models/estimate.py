@@ -40,11 +40,12 @@ def estimate_flow(
     if size is not None and min(size) < MINIMUM_SIDE:
         raise InputError(f"size {size[0]}x{size[1]}: each side must be at least {MINIMUM_SIDE} px")
     check_shapes(image1, image2, least=1 if size else SMALLEST)
-    for name, image in (("image 1", image1), ("image 2", image2)):
-        if not torch.isfinite(image).all():
-            raise InputError(f"{name} holds NaN or infinite values; images must be finite, in [0, 1]")
     device, run = next(model.parameters()).device, run or _call
     first, second = (image.to(device, torch.float32) for image in (image1, image2))
+    finite = torch.stack([image.isfinite().all() for image in (first, second)]).tolist()
+    if not all(finite):
+        number = 1 + finite.index(False)
+        raise InputError(f"image {number} holds NaN or infinite values; images must be finite, in [0, 1]")
     sizes = tuple(working_sizes(image1.shape[-2], image1.shape[-1]) if size is None else [size])
     was_training = model.training
     model.eval()

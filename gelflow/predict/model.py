@@ -69,9 +69,12 @@ class FlowModel:
                 image[:, THREE_OF[image.shape[1]]] if image.ndim == 4 and image.shape[1] in THREE_OF else image
                 for image in (image1, image2)
             )
+            brightest = 0.0
             for name, image in (("image 1", first), ("image 2", second)):
-                check_range(name, str(image.dtype), float(image.min()), float(image.max()))
-            factor = range_factor(float(max(first.max(), second.max())))
+                least, most = torch.stack([image.min(), image.max()]).tolist()  # a device is waited for once
+                check_range(name, str(image.dtype), least, most)
+                brightest = max(brightest, most)
+            factor = range_factor(brightest)
             if isinstance(self._network, Fast):
                 arrays = zip(*(image.movedim(1, -1).float().cpu().numpy() for image in (first, second)), strict=True)
                 flows = [self._network.flow(factor * one, factor * other) for one, other in arrays]
