@@ -16,7 +16,7 @@ z the sum of g r over a small neighbourhood (Newey and West 1987).
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gelflow.arrays import Features, Flow, Images
-from gelflow.ops.gaussian import window_sums
+from gelflow.ops.gaussian import doubled, window_sums
 from gelflow.ops.warp import inside_at, positions
 
 TINY = 1e-6
@@ -60,7 +60,7 @@ def compared(flow: Flow, first: Images, second: Sample) -> tuple[Images, Images,
 def without_mean(image: Features, counts: Tensor, deviation: float) -> Features:
     """An image less its mean in a Gaussian over the pixels that count, (B, 1, H, W)."""
     window = window_sums(image, deviation, 2)
-    mean = F.interpolate(window(counts * image) / window(counts).clamp(min=TINY), scale_factor=2.0, mode="bilinear")
+    mean = doubled(window(counts * image) / window(counts).clamp(min=TINY))
     return image - mean[..., : image.shape[-2], : image.shape[-1]]
 
 
@@ -87,7 +87,11 @@ def moments(flow: Flow, first: Images, second: Sample, background_px: float | No
         residual = without_mean(residual, counts, background_px)
     across, down = slopes(mean)
     pairs = ((across, across), (across, down), (across, residual), (down, down), (down, residual), (residual, residual))
-    return torch.cat([counts * _products(pairs), residual.shape[1] * counts], dim=1)
+    found = flow.new_zeros(len(flow), 7, *flow.shape[2:])
+    for plane, pair in zip(found.unbind(dim=1), pairs, strict=False):
+        _add_products(plane, *pair)
+    found[:, 6] = residual.shape[1]
+    return found.mul_(counts)
 
 
 def evidence(flow: Flow, first: Images, second: Sample, background_px: float) -> Tensor:
@@ -104,11 +108,21 @@ def evidence(flow: Flow, first: Images, second: Sample, background_px: float) ->
     both = without_mean(torch.cat([residual, mean], dim=1), counts, background_px)
     residual, mean = both.chunk(2, dim=1)
     (right, below), (across, down) = slopes(residual / 2), slopes(mean)
-    gradients = ((across, across), (across, down), (down, down))
-    noise = ((right, right), (right, below), (below, below))
-    found = counts * _products((*gradients, *noise, (across, residual), (down, residual)))
-    z = correlated(found[:, 6:]) / norm
-    return torch.cat([found[:, :3] - found[:, 3:6], _squares(z), found[:, 6:]], dim=1)
+    found = flow.new_zeros(len(flow), 8, *flow.shape[2:])
+    gradients, noises = (
+        ((across, across), (across, down), (down, down)),
+        ((right, right), (right, below), (below, below)),
+    )
+    for plane, gradient, noise in zip(found[:, :3].unbind(dim=1), gradients, noises, strict=True):
+        _add_products(plane, *gradient)
+        _add_products(plane, *noise, sign=-1)
+    for plane, gradient in zip(found[:, 6:].unbind(dim=1), (across, down), strict=True):
+        _add_products(plane, gradient, residual)
+    found *= counts
+    x, y = (correlated(found[:, 6:]) / norm).unbind(dim=1)
+    for plane, (one, other) in zip(found[:, 3:6].unbind(dim=1), ((x, x), (x, y), (y, y)), strict=True):
+        torch.mul(one, other, out=plane)
+    return found
 
 
 def step(found: Tensor, window_px: float, spacing: int = 1) -> Step:
@@ -133,12 +147,7 @@ def solved(sums: Tensor) -> Step:
     return Step(torch.where(enough, step, 0.0), torch.where(enough, variance, MAX_VARIANCE), trace)
 
 
-def _products(pairs: Sequence[tuple[Features, Features]]) -> Tensor:
-    """Products of images, summed over the colours: (B, N, H, W)."""
-    return torch.cat([(one * other).sum(dim=1, keepdim=True) for one, other in pairs], dim=1)
-
-
-def _squares(z: Flow) -> Tensor:
-    """x^2, x y and y^2 of (B, 2, h, w): (B, 3, h, w)."""
-    x, y = z.split(1, dim=1)
-    return torch.cat([x * x, x * y, y * y], dim=1)
+def _add_products(plane: Tensor, one: Features, other: Features, sign: int = 1) -> None:
+    """Adds to (B, H, W) the products of two images, summed over the colours."""
+    for first, second in zip(one.unbind(dim=1), other.unbind(dim=1), strict=True):
+        plane.addcmul_(first, second, value=sign)

@@ -18,7 +18,6 @@ leaves no trace in the images is not seen; dots taken for the next ones are `gel
 import math
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from gelflow.arrays import Features, Flow, Images
@@ -27,7 +26,7 @@ from gelflow.models.evidence import TINY, evidence, step
 from gelflow.models.registration import FINE_WINDOW_PX, MAX_STEP_PX, SPACING
 from gelflow.models.specks import speck_error
 from gelflow.models.wider_window import MIN_VARIANCE, TWO_STEPS, best_window, fine_noise
-from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
+from gelflow.ops.gaussian import SeparableFilter, doubled, smoother, window_sums
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import pixel_indices, positions
 
@@ -86,7 +85,7 @@ def error_squares(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, T
     error, moment = between_marks(error, moment / SPACING**2, variance, wide)
     moment = SPACING**2 * moment
     maps = torch.cat([error, moment.square() * bend, known.to(error.dtype)], dim=1)
-    maps = F.interpolate(maps, scale_factor=float(SPACING), mode="bilinear")[..., : flow.shape[-2], : flow.shape[-1]]
+    maps = doubled(maps)[..., : flow.shape[-2], : flow.shape[-1]]
     error, curvature, known = maps.split(1, dim=1)
     return error + speck_error(flow, image1, image2, known * gradient), curvature
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from scipy.linalg import toeplitz
 from torch import Tensor
@@ -31,7 +32,7 @@ class SeparableFilter(NamedTuple):
 
     def __call__(self, field: Features) -> Features:
         """Filters each channel of (B, C, H, W)."""
-        if self.kernel is None or field.device.type != "cpu" or field.requires_grad or field.dtype != torch.float32:
+        if self.kernel is None or not _is_array(field):
             return self.down @ field @ self.across.T
         rows, columns = len(self.down), len(self.across)
         sums = field.new_empty(*field.shape[:2], rows, columns)
@@ -41,6 +42,22 @@ class SeparableFilter(NamedTuple):
             cells = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
             cv2.sepFilter2D(cells, -1, self.kernel, self.kernel, out, borderType=cv2.BORDER_CONSTANT)
         return sums
+
+
+def doubled(cells: Features) -> Features:
+    """A field on cells of 2 x 2 px (B, C, h, w) at each pixel, (B, C, 2 h, 2 w), bilinear."""
+    if not _is_array(cells):
+        return F.interpolate(cells, scale_factor=2.0, mode="bilinear")
+    rows, columns = 2 * cells.shape[-2], 2 * cells.shape[-1]
+    finer = cells.new_empty(*cells.shape[:2], rows, columns)
+    for plane, out in zip(cells.contiguous().flatten(0, 1).numpy(), finer.flatten(0, 1).numpy(), strict=True):
+        cv2.resize(plane, (columns, rows), out, interpolation=cv2.INTER_LINEAR)
+    return finer
+
+
+def _is_array(field: Tensor) -> bool:
+    """Whether OpenCV can compute on it."""
+    return field.device.type == "cpu" and field.dtype == torch.float32 and not field.requires_grad
 
 
 def window_sums(like: Tensor, deviation: float, spacing: int = 1) -> SeparableFilter:

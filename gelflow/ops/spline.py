@@ -66,15 +66,14 @@ class SplineImage:
 
     def near(self, places: Tensor) -> Features:
         """Nearly the same."""
-        height, width = self._size
         if places.is_cuda:
             from gelflow.ops import kernels
 
             return kernels.sampled(self._quarters, places, 2.0)
-        x, y = places[:, 0] * (2 / width) + (1 / width - 1), places[:, 1] * (2 / height) + (1 / height - 1)
-        sampled: Tensor = F.grid_sample(
-            self._quarters, torch.stack([x, y], dim=-1), padding_mode="border", align_corners=False
-        )
+        height, width = self._size
+        sides = places.new_tensor([width, height]).view(2, 1, 1)
+        grid = torch.addcmul(1 / sides - 1, places, 2 / sides).movedim(1, -1)
+        sampled: Tensor = F.grid_sample(self._quarters, grid, padding_mode="border", align_corners=False)
         return sampled
 
     def _bilinear(self, x: Tensor, y: Tensor) -> Features:
