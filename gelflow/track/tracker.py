@@ -8,7 +8,6 @@ reference, and a network if that tears, too (`gelflow.fast.start`). What they le
 frame in which most of the picture is lost, such as a cut or one of a ramp of exposure, the next one starts afresh.
 """
 
-import functools
 import math
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from gelflow.arrays import FlowArray, Frame, ImageArray, MapArray
 from gelflow.errors import InputError
 from gelflow.fast.certainty import Refined, refined
-from gelflow.fast.registration import STAGES, Prepared, indices, register, resized
+from gelflow.fast.registration import CELL, STAGES, Prepared, indices, register, resized
 from gelflow.fast.start import MOST_TORN, dis, fresh_start, shipped
 from gelflow.files.image import as_image, check_images, range_factor
 from gelflow.methods.fast import FAST, Fast
@@ -37,6 +36,8 @@ RETRY = 10
 """Frames after which they compete again for what the last ones left."""
 CLEARLY_LESS = 0.5
 """Share of what the followed flow tears below which a fresh one replaces it; it may have jumped where they are near."""
+MOST_QUIET = 80
+"""Largest number of frames in which no network is asked on another thread after one that did not help; it doubles."""
 CUT = 0.5
 """Share of the picture that is lost in a frame which has nothing to do with the one before."""
 
@@ -99,7 +100,8 @@ class Tracker:
             self._image = self._factor * image
             self._first, self._markers = Prepared(self._image), Markers(self._image)
         self._last: tuple[Prepared, Refined] | None = None
-        self._asked: tuple[Prepared, Future[FlowArray]] | None = None
+        self._asked: tuple[FlowArray, Future[FlowArray]] | None = None  # motion since the frame of the question
+        self._quiet, self._pause, self._fresh_since = 0, RETRY, False
         self._since, self._accepted = 0, 0.0
         self._time_s = -math.inf
 
@@ -130,42 +132,57 @@ class Tracker:
     def _follow(self, image: ImageArray) -> tuple[Refined, bool]:
         """The flow to a frame, and whether it started afresh."""
         second, flows, afresh = Prepared(image), list[FlowArray](), self._last is None
-        self._since += 1
+        columns = second.grey.shape[1]
+        self._since, self._quiet = self._since + 1, self._quiet - 1
         if self._last is not None:
             before, last = self._last
-            flows.append(_moved_on(before, last.flow, second))
+            motion = dis("ultrafast", before.grey, second.grey)
+            flows.append(_moved_on(last.flow, motion, columns))
+            if self._asked is not None:
+                self._asked = (_moved_on(self._asked[0], motion, columns), self._asked[1])
             found = refined(register(flows[0], self._first, second, TRACKING), self._first, second, last)
             self._accepted = min(self._accepted, found.torn)
-        start = None
+        start, answered = None, None
         if self._asked is not None and self._asked[1].done():
-            (seen, answer), self._asked = self._asked, None
-            if found.torn > MOST_TORN:
-                start = register(_moved_on(seen, answer.result(), second), self._first, second, STAGES[:1])
+            answered, self._asked = self._asked, None
+            if self._fresh_since or found.torn > MOST_TORN:
+                moved = _moved_on(answered[1].result(), answered[0], columns)
+                start = register(moved, self._first, second, STAGES[:1])
         elif afresh or found.torn > (self._accepted if self._since < RETRY else 0.0) + MOST_TORN:
-            start = fresh_start(self._first, second, flows, functools.partial(self._ask, second))
+            start = fresh_start(self._first, second, flows, self._ask)
         if start is not None:
             fresh = refined(register(start, self._first, second, STAGES[1:]), self._first, second)
-            afresh = afresh or fresh.torn < CLEARLY_LESS * found.torn
+            # What began with DIS meanwhile knows as little of the stream as the network does.
+            if answered is not None and self._fresh_since:
+                afresh = afresh or fresh.torn <= found.torn
+            else:
+                afresh = afresh or fresh.torn < CLEARLY_LESS * found.torn
             found = fresh if afresh else found
             self._since, self._accepted = 0, found.torn
+            self._fresh_since = afresh and answered is None
+            if answered is not None:
+                self._pause = RETRY if afresh else min(2 * self._pause, MOST_QUIET)
+                self._quiet = self._pause
         if found.lost.mean() > CUT:
             self._last = self._asked = None
             return found._replace(sigma=np.full_like(found.sigma, MAX_SIGMA_PX)), True
         self._last = (second, found)
         return found, afresh
 
-    def _ask(self, second: Prepared, image1: ImageArray, image2: ImageArray) -> FlowArray | None:
+    def _ask(self, image1: ImageArray, image2: ImageArray) -> FlowArray | None:
         """The network's flow to a frame; None where it will come later."""
         if self._thread is None:
             return self._network(image1, image2)
-        if self._asked is None:
-            self._asked = (second, self._thread.submit(self._network, image1, image2))
+        if self._asked is None and self._quiet <= 0:
+            none = np.zeros((image2.shape[0] // CELL, image2.shape[1] // CELL, 2), np.float32)
+            self._asked = (none, self._thread.submit(self._network, image1, image2))
         return None
 
 
-def _moved_on(before: Prepared, flow: FlowArray, second: Prepared) -> FlowArray:
-    """The flow to the frame before, and what DIS sees since, on the flow's grid."""
+def _moved_on(flow: FlowArray, since: FlowArray, columns: int) -> FlowArray:
+    """A flow on its grid followed by the motion since, both in px of a picture with so many columns."""
     height, width = flow.shape[:2]
-    since = resized(dis("ultrafast", before.grey, second.grey), (height, width))
-    places = indices(height, width) + flow * (width / second.grey.shape[1])
-    return flow + cv2.remap(since, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    places = indices(height, width) + flow * (width / columns)
+    return flow + cv2.remap(
+        resized(since, (height, width)), places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
