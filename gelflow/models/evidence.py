@@ -116,8 +116,8 @@ def evidence(flow: Flow, first: Images, second: Sample, background_px: float) ->
     for plane, gradient, noise in zip(found[:, :3].unbind(dim=1), gradients, noises, strict=True):
         _add_products(plane, *gradient)
         _add_products(plane, *noise, sign=-1)
-    for plane, gradient in zip(found[:, 6:].unbind(dim=1), (across, down), strict=True):
-        _add_products(plane, gradient, residual)
+    _add_products(found[:, 6], across, residual)
+    _add_products(found[:, 7], down, residual)
     found *= counts
     x, y = (correlated(found[:, 6:]) / norm).unbind(dim=1)
     for plane, (one, other) in zip(found[:, 3:6].unbind(dim=1), ((x, x), (x, y), (y, y)), strict=True):

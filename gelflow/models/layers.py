@@ -2,6 +2,7 @@
 
 import math
 from itertools import pairwise
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -38,7 +39,7 @@ class Convolution(nn.Sequential):
     """A convolution and its leaky ReLU."""
 
     def forward(self, features: Features) -> Features:
-        layer = self[0]
+        layer: Any = self[0]
         if not features.is_cuda or torch.is_grad_enabled() or torch.is_autocast_enabled("cuda"):
             return super().forward(features)
         from gelflow.models import fused_network as fused

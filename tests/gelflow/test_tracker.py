@@ -217,6 +217,18 @@ def test_frames_that_do_not_wait_go_on_and_the_networks_answer_is_moved_on(monke
     assert wrong(Turn(15.5, shift=(5.0, 0.0)))[0] < 0.001
 
 
+def test_a_network_that_does_not_help_is_asked_ever_more_seldom(monkeypatch) -> None:
+    """Asked at first and 20, 60 and 140 frames after its answers; other starts compete in every tenth frame."""
+    tracker, asked = gelflow.Tracker(frame(), wait=False), []
+    useless = np.zeros((*SIZE, 2), np.float32)
+    monkeypatch.setattr(tracker, "_network", lambda *_: asked.append(1) or useless)
+    tracker.update(frame())
+    for number in range(50):
+        tracker.update(Turn(14.0, shift=(2.0 + 0.01 * number, 0.0)).frame(*SIZE, DOTS))
+        tracker._thread.submit(int).result()  # so that the answer is there
+    assert len(asked) == 2
+
+
 @pytest.mark.parametrize("weights", [["--weights", "fast"], ["--method", "farneback"]])
 def test_the_commands_write_markers_as_a_table(tmp_path: Path, weights: list[str], capsys) -> None:
     video = tmp_path / "a.avi"
