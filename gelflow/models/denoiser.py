@@ -50,12 +50,12 @@ class Denoiser(nn.Module):
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
-    def forward(self, flow: Flow, network: Flow, image1: Images, image2: Images) -> Flow:
+    def forward(self, flow: Flow, network: Flow, image1: Images, image2: Images | SplineImage) -> Flow:
         """A registered flow (B, 2, H, W) of two images without its noise; `network` is the flow before registration."""
         denoised, _ = self.estimate(flow, network, image1, image2)
         return torch.lerp(flow, denoised, APPLIED)
 
-    def estimate(self, flow: Flow, network: Flow, image1: Images, image2: Images) -> tuple[Flow, Tensor]:
+    def estimate(self, flow: Flow, network: Flow, image1: Images, image2: Images | SplineImage) -> tuple[Flow, Tensor]:
         """The flow with the whole correction, and s, (B, 1, H, W) px."""
         with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
             inputs, error = evidence_of(flow, network, image1, image2)
@@ -93,10 +93,11 @@ class Block(nn.Module):
         return changed
 
 
-def evidence_of(flow: Flow, network: Flow, image1: Images, image2: Images) -> tuple[Features, Tensor]:
+def evidence_of(flow: Flow, network: Flow, image1: Images, image2: Images | SplineImage) -> tuple[Features, Tensor]:
     """What the denoiser sees, (B, C, H, W), and the flow's expected error s, (B, 1, H, W) px."""
     config, to_pixels = RegistrationConfig(), interpolator(flow, 2)
-    found = evidence(flow, image1, SplineImage(image2).near, config.background_px or 0.0)
+    second = image2 if isinstance(image2, SplineImage) else SplineImage(image2)
+    found = evidence(flow, image1, second.near, config.background_px or 0.0)
     steps = [step(found, width, 2) for width in WINDOWS_PX]
     variance = posterior_variance(TWO_STEPS * steps[-1].variance, config.prior_px)
     logarithms = [one.variance.clamp(min=MIN_ERROR_PX**2).log() for one in steps]
@@ -116,4 +117,4 @@ def evidence_of(flow: Flow, network: Flow, image1: Images, image2: Images) -> tu
 
 def compressed(field: Features) -> Features:
     """Large values on a logarithmic scale, with their sign."""
-    return field.sign() * field.abs().log1p()
+    return field.abs().log1p().copysign(field)

@@ -22,6 +22,7 @@ from gelflow.models.denoiser import Denoiser
 from gelflow.models.registration import registered
 from gelflow.ops.correlation import local_correlation
 from gelflow.ops.pyramid import enlarge_flow
+from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import warp
 
 FINEST_SCALE = 2
@@ -95,11 +96,12 @@ class GelFlow(nn.Module):
         settings = self.config.registration
         if settings is None:
             return flow
-        found = registered(flow, image1, image2, settings)
+        second = SplineImage(image2.float())
+        found = registered(flow, image1, second, settings)
         if self.denoiser is None or settings != RegistrationConfig():
             return found
         with torch.no_grad(), torch.autocast(flow.device.type, torch.bfloat16, enabled=reduced):
-            denoised: Flow = self.denoiser(found, flow, image1, image2)
+            denoised: Flow = self.denoiser(found, flow, image1, second)
             return denoised
 
     def _decode(self, scale: int, first: Features, second: Features, start: Flow) -> Flow:

@@ -46,15 +46,16 @@ RESIDUAL_WINDOW_PX, BLENDING_PX = 6.0, 2.0
 """Standard deviations of the window of the residual that decides between two flows, and of the blending at its edge."""
 
 
-def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationConfig) -> Flow:
+def registered(flow: Flow, image1: Images, image2: Images | SplineImage, config: RegistrationConfig) -> Flow:
     """Corrects a flow; same shape, float32, without gradient. Each pair of a batch is treated on its own."""
     with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
-        flow, first, image2 = flow.float(), image1.float(), image2.float()
-        second, half1, half2 = SplineImage(image2), halve(first), SplineImage(halve(image2))
+        second = image2 if isinstance(image2, SplineImage) else SplineImage(image2.float())
+        flow, first, image2 = flow.float(), image1.float(), second.image
+        half1, half2 = halve(first), SplineImage(halve(image2))
         coarse = config.model_copy(update={"background_px": config.background_px and config.background_px / 2})
         former = flow
         if config.after is not None:
-            former = flow = registered(flow, first, image2, config.after)
+            former = flow = registered(flow, first, second, config.after)
         for window_px, smoothing_px in zip(config.windows_px, config.smoothing_px, strict=True):
             if config.propagation_px and window_px in (config.windows_px[0], config.windows_px[-1]):
                 flow = propagated(flow, first, image2, window_px, config)

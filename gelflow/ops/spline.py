@@ -37,7 +37,7 @@ class SplineImage:
     """
 
     def __init__(self, image: Features) -> None:
-        self._image, self._size = image, (image.shape[-2], image.shape[-1])
+        self.image, self._size = image, (image.shape[-2], image.shape[-1])
 
     @functools.cached_property
     def _coefficients(self) -> Features:
@@ -48,9 +48,9 @@ class SplineImage:
         return self._along_axes(_to_quarters)
 
     def _along_axes(self, matrix: Callable[[int, torch.dtype, torch.device], Tensor]) -> Features:
-        down, across = (matrix(pixels, self._image.dtype, self._image.device) for pixels in self._size)
-        with torch.autocast(self._image.device.type, enabled=False):  # bfloat16 keeps three digits
-            return down @ self._image @ across.T
+        down, across = (matrix(pixels, self.image.dtype, self.image.device) for pixels in self._size)
+        with torch.autocast(self.image.device.type, enabled=False):  # bfloat16 keeps three digits
+            return down @ self.image @ across.T
 
     def at(self, places: Tensor) -> Features:
         """The image (B, C, H', W') at places in it; outside, the nearest value of its border.
