@@ -116,9 +116,9 @@ class GelFlow(nn.Module):
             costs = fused.costs(both, mean, spread + 1e-6, CORRELATION_RADIUS, layers.SLOPE)
         else:
             costs = local_correlation(*normalised(first.float(), warp(second, start)), CORRELATION_RADIUS)
-            costs = F.leaky_relu(costs, layers.SLOPE)
+            costs = F.leaky_relu(costs, layers.SLOPE, inplace=not torch.is_grad_enabled())
         projected = self.projections[place](first)
-        evidence = torch.cat([costs, projected, start], dim=1)
+        evidence = torch.cat([part.to(projected.dtype) for part in (costs, projected, start)], dim=1)
         context, correction = self.estimators[network](evidence)
         coarse = start + correction.float()
         refined = coarse + self.contexts[network](context, coarse).float()

@@ -122,7 +122,7 @@ class ContextNetwork(nn.Module):
 
     def forward(self, context: Features, flow: Flow) -> Tensor:
         """Correction of the flow, (B, 2, H, W) in px of this scale."""
-        correction: Tensor = self.layers(torch.cat([context, flow], dim=1))
+        correction: Tensor = self.layers(torch.cat([context, flow.to(context.dtype)], dim=1))
         return correction
 
 
@@ -193,7 +193,7 @@ class RefinementHead(nn.Module):
                 costs = fused.costs(both, none, none + 1 / first.shape[1], REFINEMENT_RADIUS, SLOPE)
             else:
                 costs = first.shape[1] * local_correlation(first, warp(second, flow), REFINEMENT_RADIUS)
-                costs = F.leaky_relu(costs, SLOPE)
-            evidence = torch.cat([costs, first, flow], dim=1)
+                costs = F.leaky_relu(costs, SLOPE, inplace=not torch.is_grad_enabled())
+            evidence = torch.cat([part.to(encoded.dtype) for part in (costs, first, flow)], dim=1)
             flow = flow + self.head(self.layers(evidence)).float()
         return flow
