@@ -117,4 +117,4 @@ def evidence_of(flow: Flow, network: Flow, image1: Images, image2: Images | Spli
 
 def compressed(field: Features) -> Features:
     """Large values on a logarithmic scale, with their sign."""
-    return field.abs().log1p().copysign(field)
+    return field.abs().log1p_().copysign_(field)
