@@ -81,7 +81,11 @@ def surroundings(flow: Flow, texture: Tensor, trusted: Tensor) -> tuple[Flow, Te
     for _ in range(REWEIGHTINGS):
         total = weights.sum(dim=3, keepdim=True)
         normal = (weights @ products / total).unflatten(3, (3, 3)) + ridge
-        found = torch.linalg.solve(normal, (weights * flows @ design / total)[..., None])[..., 0]  # (B, 2, N, 3)
+        # By cofactors: a recording cannot ask whether `torch.linalg.solve` succeeded.
+        a, b, c = normal.unbind(dim=-1)
+        inverse = torch.stack([b.cross(c, dim=-1), c.cross(a, dim=-1), a.cross(b, dim=-1)], dim=-2)
+        inverse = inverse / (a * inverse[..., 0, :]).sum(dim=-1)[..., None, None]
+        found = (inverse @ (weights * flows @ design / total)[..., None])[..., 0]  # (B, 2, N, 3)
         apart = (flows - found @ design.T).square().sum(dim=1, keepdim=True)
         misfit = (weights * apart).sum(dim=3, keepdim=True) / total + FLOOR_PX**2
         weights = base / (1 + apart / misfit)

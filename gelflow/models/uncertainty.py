@@ -52,7 +52,7 @@ def flow_sigma(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tens
         error, curvature = error_squares(flow, image1.float(), image2.float())
         sigma = combined(error, curvature, CURVATURE)
         sigma = torch.where(known, sigma, MAX_SIGMA_PX).clamp(max=MAX_SIGMA_PX)
-        sides = flow.new_tensor([flow.shape[-1], flow.shape[-2]]).view(2, 1, 1)
+        sides = pixel_indices(flow)[:, -1:, -1:] + 1  # on the device, for a recording
         place, spread = positions(flow) + 0.5, sigma / RADIUS
         inside = torch.special.ndtr((sides - place) / spread) - torch.special.ndtr(-place / spread)
         return sigma, known * inside.prod(dim=1, keepdim=True)
