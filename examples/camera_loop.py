@@ -16,7 +16,8 @@ camera = cv2.VideoCapture(int(source) if source.isdecimal() else source)
 decoded, frame = camera.read()
 if not decoded:
     sys.exit(f"{source}: gives no frame")
-tracker = gelflow.Tracker(frame[..., ::-1])  # OpenCV's frames are BGR; the gel should be at rest
+# OpenCV's frames are BGR; the gel should be at rest. No frame waits for a network.
+tracker = gelflow.Tracker(frame[..., ::-1], wait=False)
 number = 0
 while True:
     decoded, frame = camera.read()

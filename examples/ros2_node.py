@@ -45,7 +45,7 @@ def main():
     def update(message):
         nonlocal tracker
         if tracker is None:
-            tracker = gelflow.Tracker(pixels(message))
+            tracker = gelflow.Tracker(pixels(message), wait=False)
             return
         found = tracker.update(pixels(message))
         for name, field in (("flow", found.flow), ("sigma", found.sigma[..., None])):
