@@ -42,9 +42,10 @@ def estimate_flow(
     check_shapes(image1, image2, least=1 if size else SMALLEST)
     device, run = next(model.parameters()).device, run or _call
     first, second = (image.to(device, torch.float32) for image in (image1, image2))
-    finite = torch.stack([image.isfinite().all() for image in (first, second)]).tolist()
+    # Of values some of which are NaN, so are least and largest. A device is waited for once.
+    finite = torch.stack([*first.aminmax(), *second.aminmax()]).isfinite().tolist()
     if not all(finite):
-        number = 1 + finite.index(False)
+        number = 1 + finite.index(False) // 2
         raise InputError(f"image {number} holds NaN or infinite values; images must be finite, in [0, 1]")
     sizes = tuple(working_sizes(image1.shape[-2], image1.shape[-1]) if size is None else [size])
     was_training = model.training
