@@ -9,10 +9,11 @@ from waves import Shifts
 
 from gelflow.config import REGISTRATIONS, LossConfig, ModelConfig, Registration, TrainConfig
 from gelflow.models import GelFlow
-from gelflow.models.estimate import flows_at
+from gelflow.models.estimate import estimate_flow, flows_at
 from gelflow.models.recorded import GraphedNetwork, Recorder
 from gelflow.models.registration import registered
-from gelflow.models.weights import load_weights
+from gelflow.models.weights import load_weights, weights_file
+from gelflow.models.working_size import sized_sigma
 from gelflow.ops.correlation import local_correlation
 from gelflow.training import train
 
@@ -72,6 +73,16 @@ def test_a_network_in_use_is_recorded_for_each_shape(aim: Registration) -> None:
         with torch.no_grad():
             expected = model.flow(*pair)
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
+
+
+def test_large_images_and_their_sigma_are_recorded_at_both_sizes() -> None:
+    model, run = load_weights(weights_file(None), "cuda"), Recorder()
+    pair = shifted(4, 480)
+    expected = estimate_flow(model, *pair)
+    sigma, _ = sized_sigma(expected, *pair, (240, 240))
+    for _ in range(3):
+        torch.testing.assert_close(estimate_flow(model, *pair, run=run), expected, rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(run(sized_sigma, expected, *pair, (240, 240))[0], sigma, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("aim", ["motion", "both", "brightness"])
