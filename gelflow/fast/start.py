@@ -6,7 +6,7 @@ marks, so that one mark's neighbour does not stand for it, the start with the le
 longest and is tried only where the others leave more than noise.
 
 Where marks move by half their distance or more, all may take dots for the next ones. At the edge of what was taken,
-images then differ. If they do on more than `MOST_TORN` of the picture, a network is asked, which takes ten times as
+images then differ. If they do on more than `MOST_TORN` of the picture, a network is asked, which takes three times as
 long, and of both flows the one that tears less is kept.
 """
 

@@ -111,8 +111,8 @@ def load_model(
 
     Args:
         name_or_path: "best", the weights that come with the package; a file that `gelflow train` or `finetune` wrote
-            (weights.safetensors); or "fast", DIS with fast registration on the processor, which takes a thirtieth of
-            the time, or a third where it asks the network of "best" for a start (see `gelflow.methods.fast`).
+            (weights.safetensors); or "fast", DIS with fast registration on the processor, which takes a seventh of
+            the time, or half where it asks the network of "best" for a start (see `gelflow.methods.fast`).
         device: "cpu", "cuda", or "auto", a CUDA device where there is one.
         registration: "none", "motion", "both" or "brightness": how the flow is corrected on the images; None: what the
             weights ask for, which is "motion" for "best".
