@@ -6,14 +6,17 @@ one launch a step stands for five thousand. That recording owns the memory of wh
 between two backward passes it may be called only once.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from gelflow.arrays import Flow, Images
 from gelflow.models.gelflow import GelFlow
+
+Run = Callable[..., tuple[Tensor, ...]]
 
 MOST = 4
 """Recordings that a `Recorder` remembers: flow and, for the closure, flow backward, at two shapes."""
@@ -28,13 +31,12 @@ class Recorder:
     """
 
     def __init__(self) -> None:
-        self._recordings: dict[tuple[Any, ...], _Recording | None] = {}
+        self._recordings: dict[tuple[Any, ...], Run | None] = {}
 
     @torch.no_grad()
-    def __call__(self, function: Callable[..., tuple[Tensor, ...]], *arguments: Any) -> tuple[Tensor, ...]:
+    def __call__(self, function: Run, *arguments: Any) -> tuple[Tensor, ...]:
         """What the function, which waits for nothing and returns tensors, gives for these arguments."""
-        tensors = [each for each in arguments if isinstance(each, Tensor)]
-        if not all(each.is_cuda for each in tensors):
+        if not all(each.is_cuda for each in arguments if isinstance(each, Tensor)):
             return function(*arguments)
         key = (function, *(each.shape if isinstance(each, Tensor) else each for each in arguments))
         if key not in self._recordings:
@@ -42,20 +44,12 @@ class Recorder:
                 self._recordings.clear()
             self._recordings[key] = None
             return function(*arguments)
-        recording = self._recordings[key] = self._recordings[key] or _recorded(function, arguments)
-        for kept, new in zip(recording.tensors, tensors, strict=True):
-            kept.copy_(new)
-        recording.graph.replay()
-        return tuple(each.clone() for each in recording.results)
+        replay = self._recordings[key] = self._recordings[key] or _replay(function, arguments)
+        return replay(*arguments)
 
 
-class _Recording(NamedTuple):
-    graph: torch.cuda.CUDAGraph
-    tensors: list[Tensor]
-    results: tuple[Tensor, ...]
-
-
-def _recorded(function: Callable[..., tuple[Tensor, ...]], arguments: Sequence[Any]) -> _Recording:
+def _replay(function: Run, arguments: Sequence[Any]) -> Run:
+    """What replays a call with other tensors; the function itself, with a warning, where a device cannot record it."""
     kept = [each.clone() if isinstance(each, Tensor) else each for each in arguments]
     tensors = [each for each in kept if isinstance(each, Tensor)]
     here, aside = torch.cuda.current_stream(tensors[0].device), torch.cuda.Stream(tensors[0].device)
@@ -65,9 +59,22 @@ def _recorded(function: Callable[..., tuple[Tensor, ...]], arguments: Sequence[A
         function(*kept)
     here.wait_stream(aside)
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        results = function(*kept)
-    return _Recording(graph, tensors, results)
+    try:
+        with torch.cuda.graph(graph):
+            results = function(*kept)
+    except RuntimeError as error:
+        torch.cuda.set_stream(here)  # the recording's own stream is left only where it succeeds
+        reason = str(error).partition("\n")[0]
+        warnings.warn(f"each pair takes longer, because no CUDA graph could be recorded: {reason}", stacklevel=3)
+        return function
+
+    def replay(*given: Any) -> tuple[Tensor, ...]:
+        for old, new in zip(tensors, (each for each in given if isinstance(each, Tensor)), strict=True):
+            old.copy_(new)
+        graph.replay()
+        return tuple(each.clone() for each in results)
+
+    return replay
 
 
 class GraphedNetwork:

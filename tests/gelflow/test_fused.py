@@ -1,5 +1,7 @@
 """Kernels for CUDA devices, run on the processor, against the functions that they stand for there."""
 
+from contextlib import contextmanager, nullcontext
+
 import cv2
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from gelflow.config import RegistrationConfig
 from gelflow.models.denoiser import evidence_of
 from gelflow.models.evidence import evidence, moments, step
 from gelflow.models.propagation import propagated
+from gelflow.models.recorded import Recorder
 from gelflow.models.registration import registered
 from gelflow.models.uncertainty import flow_sigma
 from gelflow.models.weights import load_weights, weights_file
@@ -86,3 +89,23 @@ def test_parts_of_the_network(on_device) -> None:
         expected = network(*images)
     for one, other in zip(on_device(network, *images), expected, strict=True):
         same(one, other, 1e-4)
+
+
+def test_a_call_that_a_device_cannot_record_is_made_as_it_is(on_device, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Nothing:
+        def wait_stream(self, other: object) -> None: ...
+
+    @contextmanager
+    def refused(graph: object):
+        yield
+        raise RuntimeError("operation not permitted when stream is capturing\nand more")
+
+    for name in ("current_stream", "Stream", "CUDAGraph"):
+        monkeypatch.setattr(torch.cuda, name, lambda *_: Nothing())
+    monkeypatch.setattr(torch.cuda, "stream", lambda _: nullcontext())
+    monkeypatch.setattr(torch.cuda, "graph", refused)
+    run, doubled = Recorder(), lambda factor, field: (factor * field,)
+    with pytest.warns(UserWarning, match="no CUDA graph could be recorded: operation not permitted") as warned:
+        found = [on_device(run, doubled, 2, torch.full((2,), float(number)))[0] for number in range(4)]
+    assert len(warned) == 1
+    assert torch.stack(found)[:, 0].tolist() == [0, 2, 4, 6]
