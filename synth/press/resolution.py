@@ -33,7 +33,7 @@ from synth.scene import Gel, MeshIndenter, Numerics, Scene
 
 ELEMENTS_ACROSS = (4, 6, 8, 10, 12, 14, 16)
 """Elements across the contact to choose from."""
-FINER = (20, 24, 32)
+FINER = (20, 24, 28, 32, 40)
 """More of them, for a stated `fillet_mm` or a target in percent alone: they take minutes."""
 CONTACT_ACROSS = 12
 """Fewest elements across the contact where outputs.contact or slip asks for its edge."""

@@ -33,7 +33,7 @@ def test_a_stated_fillet_is_kept_by_a_finer_mesh_and_a_default_one_may_be_raised
 @pytest.mark.parametrize(
     ("numerics", "setting"),
     [
-        ({}, "32 elements across the contact"),
+        ({}, "40 elements across the contact"),
         ({"solver": "batched"}, "numerics.cells"),
         ({"edge_length_mm": 1.0}, r"numerics.edge_length_mm = 0\.0"),
     ],

@@ -79,12 +79,19 @@ class Scripted:
         return [r for r in self.asked if r is kind or (isinstance(kind, type) and isinstance(r, kind))]
 
 
-def steps(depth_mm: float = 0.3, count: int = 1, frames: frozenset[int] | None = None, **motion: Any) -> LoadSteps:
+def steps(
+    depth_mm: float = 0.3,
+    count: int = 1,
+    frames: frozenset[int] | None = None,
+    percent: float | None = None,
+    **motion: Any,
+) -> LoadSteps:
     """The policy of a ball, with load steps of at most 0.1 mm."""
+    own = {} if percent is None else {"element": "p2p1", "edge_length_mm": None, "target_error_percent": percent}
     posed = scene(
         friction=0.5,
         motion={"depth_mm": depth_mm, "steps": count, **motion},
-        numerics={"max_step_mm": 0.1, "tolerance": TOLERANCE},
+        numerics={"max_step_mm": 0.1, "tolerance": TOLERANCE, **own},
     )
     path = LoadPath(posed.motion, rigid_body(SPHERE_BODY))
     return LoadSteps(path, (8.0, 6.0, 4.0), True, posed.numerics, SolverOptions(), frames)
@@ -240,6 +247,11 @@ def test_passes_that_fail_are_halved_undone_and_at_last_given_up() -> None:
     assert record.evaluation.deepest_mm == 0.004
     assert len(back_end.all_of(ask.Do.RESTORE_PASS)) == 3
     assert len(back_end.all_of(ask.Do.RESTORE_STEP)) == 1
+    # A budget for force is worth more attempts.
+    patient = Scripted(falls=1e-7, deepest_mm=0.004)
+    patient.trial = lambda at, seen: replace(seen, free=nan) if patient.all_of(ask.Augment) else seen
+    assert led(steps(0.1, percent=1.0).run(), patient.answer) == ""
+    assert len(patient.all_of(ask.Augment)) == multipliers.MAX_FAILURES
     # What stays deeper than a fifth of the depth is not recorded.
     back_end = Scripted(falls=1e-7, deepest_mm=0.2)
     back_end.trial = lambda at, seen: replace(seen, free=nan) if back_end.all_of(ask.Augment) else seen

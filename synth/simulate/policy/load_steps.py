@@ -57,7 +57,8 @@ class LoadSteps:
         """
         self._path, self._size_mm, self._rubs, self._numerics, self._options = path, size_mm, rubs, numerics, options
         self._relaxed_tolerance = max(options.relaxed_tolerance, numerics.tolerance)
-        self._passes = Passes(path, numerics.tolerance, self._relaxed_tolerance, options.correction_iterations, closer)
+        limits = (numerics.tolerance, self._relaxed_tolerance, options.correction_iterations)
+        self._passes = Passes(path, *limits, closer, patient=numerics.target_error_percent is not None)
         self._waypoints = path.waypoints().tolist()
         records = path.records().tolist()
         self._recorded = frozenset(records)

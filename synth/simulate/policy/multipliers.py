@@ -12,9 +12,9 @@ MAX_MULTIPLIER_UPDATES = 2.0
 """Whole updates of the multipliers at a recorded state, in all. Not every contact point of a face on a curved body can
 come to rest on the surface, so that more updates make the tractions uneven."""
 FAILURES, MAX_FAILURES = 3, 8
-"""Failed updates after which the passes end, the second number where they begin deeper than SINKING; an object's deeper
-than DEEP go on. Updates are halved after a failure and doubled after a success: where a whole one upsets Newton's
-method a part of it does not."""
+"""Failed updates after which the passes end, the second number where they begin deeper than SINKING or are patient; an
+object's deeper than DEEP go on. Updates are halved after a failure and doubled after a success: where a whole one
+upsets Newton's method a part of it does not. What is left after the first number can be 2 % of the force."""
 DEEP = 0.02
 """Share of the press depth (at least 0.1 mm). A triangle mesh that penetrates by more gets up to MAX_DEEP_PASSES
 passes, failed ones included. After the first success each pass doubles the contact stiffness, to at most
@@ -50,6 +50,7 @@ class Passes:
     Attributes:
         tolerance: of what is recorded; relaxed_tolerance: of intermediate steps.
         limit: most iterations of a pass that is not near its equilibrium.
+        patient: whether more updates may fail, for forces within a percent.
     """
 
     path: LoadPath
@@ -57,6 +58,7 @@ class Passes:
     relaxed_tolerance: float
     limit: int
     closer: float = 1.0
+    patient: bool = False
 
     def run(self, solution: Solution) -> Asking[Solution]:
         """Passes by whole updates, or as large a share of them as converges; the iterations of all are counted.
@@ -72,7 +74,7 @@ class Passes:
         while solution.converged and solution.at.deepest_mm > PENETRATION * scale:
             deepest = solution.at.deepest_mm
             deep = is_mesh and deepest > DEEP * scale
-            allowed = MAX_FAILURES if deepest > SINKING * scale else FAILURES
+            allowed = MAX_FAILURES if self.patient or deepest > SINKING * scale else FAILURES
             if passes >= MAX_DEEP_PASSES if deep else done >= MAX_MULTIPLIER_UPDATES or failures >= allowed:
                 break
             passes += 1
