@@ -299,7 +299,7 @@ def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> i
     seen = f"so {camera.width / scale:.3g} x {camera.height / scale:.3g} mm if undistorted and seen straight on"
     print(
         f"picture: {camera.width} x {camera.height} px, principal point {camera.cx:.4g}, {camera.cy:.4g}, {scale:.3g} "
-        f"px per mm on the gel, {seen if sensor.gel.is_flat and camera.lens == 'pinhole' else 'at most'}\n"
+        f"px per mm on the gel, {seen if sensor.gel.shape == 'box' and camera.lens == 'pinhole' else 'at most'}\n"
         f"mesh: {predicted.resolution}, about {predicted.nodes} displacement nodes\n"
         + "".join(f"{line}\n" for line in predicted.error_lines())
         + f"predicted per {unit}: {stages}; {predicted.bytes_per_pair / 1e6:.2f} MB\n"

@@ -198,7 +198,7 @@ def render_settings(template: Template) -> Render:
 def _check_places(template: Template, out: Path) -> None:
     """Refuses round gels, and to write over what is not calibrate's own."""
     gel = template.corners[0].sensor.gel
-    if not gel.is_flat:
+    if gel.shape != "box":
         raise InputError(f"{template.label}: sensor.gel.shape: calibrate fits flat gels only, not a {gel.shape}")
     refuse_foreign(out / SCENE, MARK.encode(), out / PICTURE, out / NUMBERS, out / MAP, out / FILE, out / FLAT)
     if (out / SCENE).resolve() == template.source.resolve():

@@ -29,6 +29,14 @@ Item = TypeVar("Item")
 _FAR_MM = 1e6
 _MOST_TRIANGLES = 5_000_000
 """Of a surface when its faces are subdivided."""
+_FORMER_DEFAULTS = {
+    **dict.fromkeys(("dome_radius_mm", "radius_mm", "thickness_mm", "outer", "window", "unit", "center_z_mm")),
+    "length_mm": 0.0,
+    "cut_end": "free",
+    "rotation_deg": [0.0, 0.0, 0.0],
+    "digest": "",
+}
+"""Of fields that once all shapes of gels and windows had."""
 _Row = tuple[float, float, float]
 
 
@@ -266,7 +274,19 @@ def read_pair(folder: Path, layout: Layout, frame: int = 1) -> CameraPair:
 def read_scene(folder: Path) -> Scene:
     """The drawn scene in a sample's meta.json; InputError where that is damaged, or of another version's schema."""
     try:
-        return Scene.model_validate(read_meta(folder)["scene"])
+        return Scene.model_validate(_in_schema(read_meta(folder)["scene"]))
     except ValidationError as error:
         what = error.errors()[0]["msg"]
         raise InputError(f"{folder / META_FILE}: its scene does not fit this version of synth: {what}") from error
+
+
+def _in_schema(scene: dict[str, Any]) -> dict[str, Any]:
+    """A recorded scene without fields of other shapes, which earlier versions wrote at their defaults."""
+    sensor = dict(scene.get("sensor", {}))
+    for name in ("gel", "window"):
+        match sensor.get(name):
+            case {"shape": shape, **fields}:
+                unused = _FORMER_DEFAULTS | ({"size_mm": fields.get("size_mm")} if shape == "capsule" else {})
+                own = {key: value for key, value in fields.items() if key not in unused or value != unused[key]}
+                sensor[name] = {"shape": shape, **own}
+    return {**scene, "sensor": sensor}

@@ -21,7 +21,7 @@ from synth.mesh.face import FLAT_FACE, Face, PadFace, face_of
 from synth.mesh.layered import layered
 from synth.mesh.pad import PadMesh
 from synth.mesh.tetrahedralise import ENVELOPE, GRADING, background_of, box_sides, tetrahedralise, tetrahedralise_box
-from synth.scene import Gel, Numerics
+from synth.scene import FileGel, Gel, Numerics, PadGel
 from synth.untrusted import open_file
 
 SURFACE, ROOM = 0.5, 1.5
@@ -35,7 +35,7 @@ def edge_length(gel: Gel, numerics: Numerics) -> float:
     """Edge length (mm) of fTetWild's mesh at the contact face: as given, or by default a fifth of the gel's thickness,
     at most 1 mm; of a round gel, whose one mesh serves all trajectories, four fifths and at most a sixth of the radius.
     """
-    default_mm = min(0.8 * gel.depth_mm, gel.size_mm[0] / 12) if gel.is_round else min(gel.size_mm[2] / 5, 1.0)
+    default_mm = min(gel.depth_mm / 5, 1.0) if isinstance(gel, PadGel) else min(0.8 * gel.depth_mm, gel.size_mm[0] / 12)
     return numerics.edge_length_mm or default_mm
 
 
@@ -47,10 +47,9 @@ def mesh_key(gel: Gel, numerics: Numerics) -> str:
         "edge_length_mm": edge_length(gel, numerics),
         "grading": GRADING,
         "envelope": ENVELOPE,
+        **gel.model_dump(include={"thickness_mm"}),
     }
-    if gel.is_round:
-        recipe["thickness_mm"] = gel.thickness_mm
-    if gel.digest:
+    if isinstance(gel, FileGel):
         recipe["files"] = gel.digest
     return hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -68,7 +67,7 @@ def pad_mesh(
     Of the numerics the edge length counts. The folders are searched in order, by default the user's cache; the gel's
     own files are relative to `scene_folder`. InputError where layers or a dome turn a tetrahedron over.
     """
-    key, face = mesh_key(gel, numerics), face_of(gel, scene_folder or Path()) if gel.is_round else FLAT_FACE
+    key, face = mesh_key(gel, numerics), FLAT_FACE if gel.dome_radius_mm else face_of(gel, scene_folder or Path())
     paths = [folder / f"{key}.npz" for folder in (folders if folders is not None else [user_cache()])]
     mesh = next((found for path in paths if (found := _read(path, gel, face)) is not None), None)
     if mesh is None:

@@ -18,7 +18,7 @@ ON_MM = 1e-6
 
 @dataclass(frozen=True)
 class CadFace:
-    """The shape of a gel between two files' surfaces; the attributes are those of `synth.scene.Gel`."""
+    """The shape of a gel between two files' surfaces; the attributes are those of `synth.scene.FileGel`."""
 
     outer: Path
     window: Path

@@ -12,7 +12,7 @@ import numpy as np
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh.cad import CadFace
 from synth.mesh.capsule import CapsuleFace
-from synth.scene import Gel
+from synth.scene import CapsuleGel, FileGel, Gel
 from synth.scene.gel import dome_height
 
 
@@ -45,12 +45,14 @@ Face = PadFace | RoundFace
 
 def face_of(gel: Gel, folder: Path = Path()) -> Face:
     """The shape of a scene's gel, whose files are relative to `folder`."""
-    if gel.radius_mm is not None and gel.thickness_mm is not None:
-        return CapsuleFace(gel.radius_mm, gel.thickness_mm, gel.length_mm, gel.cut_end == "held")
-    if gel.outer is not None and gel.window is not None:
-        files = folder / gel.outer, folder / gel.window
-        return CadFace(*files, gel.unit or "mm", gel.rotation_deg, gel.cut_end == "held")
-    return PadFace(gel.dome_radius_mm)
+    match gel:
+        case CapsuleGel():
+            return CapsuleFace(gel.radius_mm, gel.thickness_mm, gel.length_mm, gel.cut_end == "held")
+        case FileGel():
+            files = folder / gel.outer, folder / gel.window
+            return CadFace(*files, gel.unit, gel.rotation_deg, gel.cut_end == "held")
+        case _:
+            return PadFace(gel.dome_radius_mm)
 
 
 def face_height(places: FloatArray, dome_radius_mm: float | None) -> FloatArray:

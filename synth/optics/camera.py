@@ -15,7 +15,7 @@ from synth.optics.lens import FisheyeLens, PinholeLens
 from synth.optics.mirror import DIRECT, NOTHING, FlatMirror, first_met
 from synth.optics.pose import Pose
 from synth.optics.window import RoundWindow, Window
-from synth.scene import Sensor
+from synth.scene import CurvedWindow, Sensor
 
 Paths = NDArray[np.intp]
 """(n,) path numbers."""
@@ -161,6 +161,6 @@ class Optics:
 
 def _window(sensor: Sensor) -> Window | RoundWindow:
     given = sensor.window
-    if given.radius_mm is None:
-        return Window(given.refractive_index, sensor.gel.size_mm[2] + given.thickness_mm)
-    return RoundWindow(given.refractive_index, given.radius_mm, *given.axis_mm)
+    if isinstance(given, CurvedWindow):
+        return RoundWindow(given.refractive_index, given.radius_mm, *given.axis_mm)
+    return Window(given.refractive_index, sensor.gel.size_mm[2] + given.thickness_mm)

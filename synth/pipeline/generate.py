@@ -43,7 +43,7 @@ from synth.pipeline.worker_pool import cores, outcomes_of_processes
 from synth.planning import Plan, plan, predict
 from synth.render.variant import Variant
 from synth.sampling import draw_sensor, sensor_of
-from synth.scene import Gel
+from synth.scene import Gel, Sensor
 from synth.scene.template import Template
 
 SOLVER_BYTES, WORKER_BYTES = 6 * 2**30, 2 * 2**30
@@ -290,7 +290,7 @@ def _tasks(context: JobContext, writer: DatasetWriter, n: int, finished: set[int
         if sensor != meshed and context.mesh_folders:
             instance = draw_sensor(template, context.job.seed, sensor)
             if instance.content is not None:
-                _store_mesh(context, writer, Gel.model_validate(instance.content["sensor"]["gel"]))
+                _store_mesh(context, writer, Sensor.model_validate(instance.content["sensor"]).gel)
             meshed = sensor
         yield trajectory, wanted
 

@@ -17,7 +17,7 @@ from synth.render.measured_light import read_measured_light
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.sampling import draw
-from synth.scene import Scene
+from synth.scene import PadGel, Scene
 from synth.surface import GelSurface
 
 SUBDIVISIONS = {False: 4, True: 3}
@@ -73,7 +73,7 @@ class RenderSession:
             return
         with suppress(InputError):  # a job whose first sensor cannot be drawn or rendered says so in its turn
             scene = draw(self._context.plan.template, self._context.job.seed, 0)
-            if scene.sensor.gel.is_flat:
+            if scene.sensor.gel.shape == "box":
                 self._prepared(scene, 0, rest_surface(scene.sensor.gel))
 
     def render_frames(self, simulated: SimulatedTrajectory) -> RenderedTrajectory:
@@ -115,7 +115,7 @@ class RenderSession:
             folder = self._context.plan.template.folder
             painted = albedo(sensor, self._context.stream("pattern", number), folder)
             measured = read_measured_light(sensor, folder)
-            surface = meshed if sensor.gel.is_round else rest_surface(sensor.gel)
+            surface = rest_surface(sensor.gel) if isinstance(sensor.gel, PadGel) else meshed
             renderer = self._sensor.renderer if self._sensor else None
             if renderer is None or not renderer.reuse(sensor, scene.render, surface, painted, measured):
                 renderer = Renderer(sensor, scene.render, surface, painted, variant, measured)

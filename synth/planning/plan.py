@@ -65,7 +65,7 @@ class Plan:
         apertures = [camera.aperture_mm for camera in cameras]
         pinhole = "" if max(apertures) > 0 else ": a pinhole"
         lens = any(any(camera.distortion) or camera.lens == "fisheye" for camera in cameras)
-        own_frames = ": domes have own frames" if any(s.gel.dome_radius_mm for s in sensors) else ""
+        own_frames = ": domes have own frames" if any(s.gel.shape == "dome" for s in sensors) else ""
         mirrors, further = max(len(s.mirrors) for s in sensors), max(len(s.further_cameras) for s in sensors)
         lights = {c.render.light for c in corners}
         separated = any(is_separated(c.render, c.sensor, variant) for c in corners)
@@ -126,7 +126,8 @@ def plan(scene: Template | str | Path, variant: Variant | None = None) -> Plan:
     check_buildable(scene, variant)
     suits = variant.is_on_gpu and not any(corner.motion.poses for corner in scene.corners) and not _own_pads(scene)
     batched = scene.numerics.solver == "batched" or (scene.numerics.solver == "auto" and suits)
-    return Plan(scene, variant, batched, MeshRule.of(max(scene.corners, key=lambda c: c.sensor.gel.is_round), batched))
+    rules = [MeshRule.of(corner, batched) for corner in scene.corners]
+    return Plan(scene, variant, batched, max(rules, key=lambda rule: rule.kind == "tetwild"))
 
 
 def check_buildable(template: Template, variant: Variant) -> None:

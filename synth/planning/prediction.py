@@ -19,7 +19,7 @@ from synth.press.press import edge_radius_mm
 from synth.press.resolution import Resolution, resolution_mm
 from synth.press.scene_path import path_of
 from synth.sampling import draw
-from synth.scene import Gel, MeshIndenter, Scene
+from synth.scene import CapsuleGel, FileGel, Gel, MeshIndenter, Scene, Vector3
 from synth.simulate.solve import VICINITY
 
 _Errors = tuple[float, float] | None
@@ -204,8 +204,8 @@ def _tetwild_meshes(plan: Plan) -> _Meshes:
     first = plan.template.corners[0]
     gel = first.sensor.gel
     edge_mm = edge_length(gel, plan.template.numerics)
-    x, y, z = (length / edge_mm for length in _plate(gel))
-    per_area = NODES_PER_CURVED_AREA if gel.is_round else NODES_PER_AREA
+    plate_mm, per_area = _plate(gel)
+    x, y, z = (length / edge_mm for length in plate_mm)
     vertices = NODES_PER_VOLUME * x * y * z + per_area * 2 * (x * y + y * z + z * x)
     vertices += NODES_PER_CURVED_AREA * x * y * sum(elements_through(gel.layers_mm, edge_mm))
     nodes = max(FEWEST_NODES, round(_order(first) * vertices))
@@ -213,19 +213,20 @@ def _tetwild_meshes(plan: Plan) -> _Meshes:
     return [(corner, nodes) for corner in plan.template.corners], text, None, None
 
 
-def _plate(gel: Gel) -> tuple[float, float, float]:
-    """Edge lengths of a box; of a round gel those of a flat layer as large as what a press moves of it."""
-    if not gel.is_round:
-        return gel.size_mm
+def _plate(gel: Gel) -> tuple[Vector3, float]:
+    """Edge lengths of a box, and vertices per area of its faces; of a round gel what a press moves of it, laid flat."""
     thickness = gel.depth_mm
-    if gel.shape == "file":
-        x, y, z = gel.size_mm
-        around, along = x + 2 * (1 + x / y) * (z - thickness), y
-    else:
-        middle = (gel.size_mm[0] - thickness) / 2
-        around, along = 2 * np.pi * middle, middle + gel.length_mm
+    match gel:
+        case FileGel():
+            x, y, z = gel.size_mm
+            around, along = x + 2 * (1 + x / y) * (z - thickness), y
+        case CapsuleGel():
+            middle = gel.radius_mm - thickness / 2
+            around, along = 2 * np.pi * middle, middle + gel.length_mm
+        case _:
+            return gel.size_mm, NODES_PER_AREA
     moved = 2 * (VICINITY + 1) * thickness
-    return min(around, moved), min(along, moved), thickness
+    return (min(around, moved), min(along, moved), thickness), NODES_PER_CURVED_AREA
 
 
 def _order(scene: Scene) -> float:

@@ -17,7 +17,7 @@ from synth.mesh.face import face_height
 from synth.press.indenter import Touchable
 from synth.press.load_path import OVER, TOUCH_MM, LoadPath, Pose
 from synth.press.measure import Distance
-from synth.scene import Gel, Motion, Vector3
+from synth.scene import Gel, Motion, RoundGel, Vector3
 from synth.scene.motion import TWIST_ARM_MM
 
 PAUSE_MM = 1e-6
@@ -69,7 +69,7 @@ class PosedPath(LoadPath):
 
     @cached_property
     def depth_scale_mm(self) -> float:
-        return ROUND_SHARE * self.gel.depth_mm if self.gel.is_round else max(self.as_press().depth_mm, 0.1)
+        return ROUND_SHARE * self.gel.depth_mm if isinstance(self.gel, RoundGel) else max(self.as_press().depth_mm, 0.1)
 
     def pose(self, s: float) -> Pose:
         """The indenter at path length s, 0 <= s <= length_mm.
@@ -99,7 +99,7 @@ class PosedPath(LoadPath):
 
     def check(self) -> None:
         """InputError, with the line of the file, for a pose that cannot be; of round gels nothing is asked here."""
-        if self.gel.is_round:
+        if isinstance(self.gel, RoundGel):
             return
         x, y = (axis.ravel() for axis in np.meshgrid(*(np.linspace(-s / 2, s / 2, OVER) for s in self.gel.size_mm[:2])))
         face, deepest = face_height(np.column_stack([x, y]), self.dome_radius_mm), DEEPEST * self.gel.depth_mm

@@ -21,7 +21,7 @@ from synth.press.resolution import (
     shared_spacing_mm,
 )
 from synth.press.scene_path import path_of
-from synth.scene import MeshIndenter, Scene
+from synth.scene import MeshIndenter, RoundGel, Scene
 from synth.scene.numerics import MAX_PENALTY
 
 BLUNTER = ((1.5, 1.0), (1.5, 2.0), (2.25, 4.0), (1.8, 3.0), (1.0, 2.0))
@@ -99,7 +99,7 @@ class MeshRule:
     def of(cls, scene: Scene, is_batched: bool = False) -> "MeshRule":
         """The rule of a scene; `is_batched`: many trajectories are simulated at once."""
         numerics = scene.numerics
-        if numerics.edge_length_mm is not None or scene.sensor.gel.is_round:
+        if numerics.edge_length_mm is not None or isinstance(scene.sensor.gel, RoundGel):
             return cls("tetwild", float("nan"))
         kind: Literal["even", "graded"] = "even" if is_batched else "graded"
         return cls(kind, numerics.target_error_px or DEFAULT_TARGET_PX, numerics.target_error_percent)

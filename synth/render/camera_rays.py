@@ -285,7 +285,7 @@ def pinhole(sensor: Sensor) -> dict[str, Any]:
     """
     optics, camera = Optics.of(sensor), sensor.camera
     need = f"needs LLVM 16 or newer, or an NVIDIA GPU, which this machine lacks ({LLVM_HINT})"
-    is_round = sensor.window.is_round and optics.window.index != 1
+    is_round = isinstance(optics.window, RoundWindow) and optics.window.index != 1
     if camera.lens != "pinhole" or sensor.mirrors or is_round:
         what = "sensor.mirrors" if sensor.mirrors else f"sensor.camera.lens = {camera.lens!r}"
         what = f"sensor.window.shape = {sensor.window.shape!r}" if is_round else what

@@ -21,7 +21,7 @@ from synth.arrays import FloatArray, Points, Triangles
 from synth.render.aligned import aligned
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import reflecting_plane
-from synth.scene import Sensor
+from synth.scene import RoundGel, Sensor
 
 _DEGREE = 4
 """Degree of V's polynomials."""
@@ -102,7 +102,7 @@ class FrameGeometry:
         self.sizes = len(placed), len(faces)
         self.bounces = is_deep and bool(high[2] - low[2] > _CLEARANCE_MM)
         self.cavity, self.window, self.returning = None, None, None
-        if self.bounces and sensor.gel.is_round:
+        if self.bounces and isinstance(sensor.gel, RoundGel):
             self.cavity = SmoothFit(placed, faces, Nodes.centres(faces), low, high)
         if is_deep and reflecting_plane(sensor) is not None:
             half = np.array(sensor.gel.size_mm[:2]) / 2

@@ -1,6 +1,7 @@
 """What all parts of a scene's schema share."""
 
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -16,3 +17,12 @@ class Part(BaseModel):
     """Base of every part of a scene: frozen, closed to unknown keys, finite numbers only."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def shape_or(default: str) -> Callable[[Any], Any]:
+    """What tells the members of a union of shapes apart, where a table that names no shape has the default one."""
+
+    def shape(value: Any) -> Any:
+        return value.get("shape", default) if isinstance(value, dict) else getattr(value, "shape", default)
+
+    return shape

@@ -6,11 +6,11 @@ px; the unit is in the field's name. Frame: origin at the centre of the undeform
 through the gel toward the camera, +x right and +y down in the image (a left-handed triple, see docs/decisions.md).
 """
 
-import math
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from synth.scene.gel import PadGel, RoundGel
 from synth.scene.indenter import Indenter
 from synth.scene.motion import Motion
 from synth.scene.numerics import Numerics, Render
@@ -76,7 +76,7 @@ class Scene(Part):
     @model_validator(mode="after")
     def _plausible(self) -> "Scene":
         gel, size, motion = self.sensor.gel, self.sensor.gel.size_mm, self.motion
-        self._check_place()
+        gel.check_place(motion)
         for name in ("slip", "previous"):
             if getattr(self.outputs, name) and self.sampling.kind != "clips":
                 raise ValueError(f'outputs.{name} = true: pairs have no frame before; give sampling.kind = "clips"')
@@ -104,7 +104,7 @@ class Scene(Part):
                 f"motion.steps = {motion.steps} cannot record every pose of motion.then: there are {moves} "
                 f"moves, press and shear among them, and each needs a step; at least {moves}"
             )
-        if gel.is_round and self.numerics.target_error_percent is not None:
+        if isinstance(gel, RoundGel) and self.numerics.target_error_percent is not None:
             raise ValueError(
                 f'numerics.target_error_percent: for a "{gel.shape}" gel no error is predicted; leave it out, and give '
                 "edge_length_mm"
@@ -116,43 +116,19 @@ class Scene(Part):
             )
         return self
 
-    def _check_place(self) -> None:
-        """Refuse a place of the press that is not in the terms of the gel's shape, or not on its face."""
-        gel, motion = self.sensor.gel, self.motion
-        polar, height = motion.polar_deg, motion.height_mm
-        if not gel.is_round:
-            if polar is not None or height is not None or motion.azimuth_deg != 0:
-                raise ValueError(
-                    f'motion.polar_deg, height_mm and azimuth_deg are for round gels; a "{gel.shape}" has position_mm'
-                )
-            return
-        if gel.shape == "file":
-            if polar is None and height is None and motion.azimuth_deg != 0:
-                raise ValueError("motion.azimuth_deg goes with polar_deg or height_mm; without, the press is along z")
-        elif motion.position_mm != (0.0, 0.0):
-            raise ValueError("motion.position_mm is for flat gels and domes; a round gel has polar_deg and azimuth_deg")
-        if polar is not None and height is not None:
-            raise ValueError("motion.polar_deg and height_mm both say where the press is: give one of them")
-        radius, top = gel.size_mm[0] / 2, gel.size_mm[2]
-        highest = 90 + math.degrees(math.atan2(top - radius, radius))
-        if polar is not None and polar > highest:
-            raise ValueError(f"motion.polar_deg = {polar} is beyond the gel's end; at most {highest:.4g}")
-        if height is not None and height > top:
-            raise ValueError(f"motion.height_mm = {height} is beyond the gel's end; at most {top:.4g}")
-
     @property
     def warnings(self) -> list[str]:
         """What is possible but unusual."""
         found = []
-        x, y = self.sensor.gel.size_mm[:2]
-        thickness, modulus = self.sensor.gel.depth_mm, self.sensor.gel.youngs_modulus_kpa
+        gel = self.sensor.gel
+        thickness, modulus = gel.depth_mm, gel.youngs_modulus_kpa
         if not 1 <= modulus <= 20_000:
             found.append(f"sensor.gel.youngs_modulus_kpa = {modulus:g}: gels have 10 to 2,000 kPa; check its unit")
         for name, pose in self.motion.stops.items():
             given = f"{name}.shear_mm = {list(pose.shear_mm)}"
             if max(map(abs, pose.shear_mm)) > 2 * thickness:
                 found.append(f"{given} is more than twice the gel's thickness ({thickness} mm)")
-            ends = zip(self.motion.position_mm, pose.shear_mm, (x / 2, y / 2), strict=True)
-            if not self.sensor.gel.is_round and any(abs(start + s) > half for start, s, half in ends):
+            ends = zip(self.motion.position_mm, pose.shear_mm, gel.size_mm[:2], strict=True)
+            if isinstance(gel, PadGel) and any(abs(start + s) > side / 2 for start, s, side in ends):
                 found.append(f"{given} takes the indenter's centre off the pad")
         return found

@@ -1,7 +1,7 @@
-"""The part of a scene's schema that is the sensor: window, coating and lights around gel, pattern and cameras."""
+"""The part of a scene's schema that is the sensor: coating and lights around gel, window, pattern and cameras."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field, model_validator
 
@@ -9,49 +9,7 @@ from synth.scene.camera import Camera, FurtherCamera, Mirror
 from synth.scene.gel import Gel
 from synth.scene.part import Color, Fraction, NonNegative, Part, Positive, Vector3
 from synth.scene.pattern import Pattern
-
-
-class Window(Part):
-    """Rigid clear support between gel and camera, index-matched to the gel.
-
-    Light bends at its face towards the camera: a plane beyond the gel, or a round face about the z axis that encloses
-    the camera in air. A plane reflects light back onto the gel (but not in scalar variants), a round face does not.
-    """
-
-    refractive_index: Annotated[float, Field(ge=1, le=2.5)] = 1.45
-    """1: matched to the camera's side, too; nothing bends."""
-    thickness_mm: Annotated[float, Field(ge=0, le=100)] = 5.0
-    shape: Literal["plane", "sphere", "cylinder", "capsule"] = "plane"
-    """capsule: a hemisphere toward the tip and a cylinder above it."""
-    radius_mm: Positive | None = None
-    """Radius of the round face itself."""
-    center_z_mm: float | None = None
-    """Z of the centre of the sphere or hemisphere."""
-
-    @property
-    def is_round(self) -> bool:
-        return self.shape != "plane"
-
-    @property
-    def axis_mm(self) -> tuple[float, float]:
-        """Ends of the part of the z axis from which all of a round face is radius_mm away."""
-        centre = self.center_z_mm or 0.0
-        low = -math.inf if self.shape == "cylinder" else centre
-        return low, centre if self.shape == "sphere" else math.inf
-
-    def clearance_mm(self, point: Vector3) -> float:
-        """How far a point lies inside a round face; negative outside."""
-        x, y, z = point
-        low, high = self.axis_mm
-        return (self.radius_mm or 0.0) - math.hypot(x, y, z - min(max(z, low), high))
-
-    @model_validator(mode="after")
-    def _shaped(self) -> "Window":
-        wanted = {"radius_mm": self.is_round, "center_z_mm": self.shape in ("sphere", "capsule")}
-        for name, is_wanted in wanted.items():
-            if is_wanted != (getattr(self, name) is not None):
-                raise ValueError(f'shape = "{self.shape}" {"needs" if is_wanted else "has no"} {name}')
-        return self
+from synth.scene.window import CurvedWindow, PlaneWindow, Window
 
 
 class Coating(Part):
@@ -114,7 +72,7 @@ class Sensor(Part):
     """Everything but contact and motion: gel, optics and light."""
 
     gel: Gel
-    window: Window = Window()
+    window: Window = PlaneWindow()
     coating: Coating = Coating()
     pattern: Pattern
     lights: tuple[Light, ...] = Field(min_length=1)
@@ -141,15 +99,16 @@ class Sensor(Part):
         names = [camera.name for camera in self.further_cameras]
         if len(set(names)) < len(names):
             raise ValueError(f"further_cameras: names must differ, they are {', '.join(names)}")
-        if self.window.is_round:
-            self._check_inside()
+        if isinstance(self.window, CurvedWindow):
+            self._check_inside(self.window)
         else:
             self._check_beyond()
-        placing, shape = getattr(self.pattern, "placing", "z"), self.gel.shape
-        if placing == "uv" and shape != "file":
-            raise ValueError(f'pattern.placing = "uv" needs gel.shape = "file", the shape is "{shape}"')
-        if placing in ("spherical", "cylindrical") and not self.gel.is_round:
-            raise ValueError(f'pattern.placing = "{placing}" is for round gels, the shape is "{shape}": use "z"')
+        placing, allowed = getattr(self.pattern, "placing", "z"), self.gel.placings
+        if placing not in allowed:
+            raise ValueError(
+                f'pattern.placing = "{placing}" does not suit gel.shape = "{self.gel.shape}", which allows '
+                f"{', '.join(allowed)}"
+            )
         if not any(light.power for light in self.lights):
             raise ValueError("lights: no light has power; give at least one of them a power above 0")
         thickness = self.gel.size_mm[2]
@@ -164,13 +123,13 @@ class Sensor(Part):
                 raise ValueError(f"lights[{i}].position_mm lies outside the curved gel")
         return self
 
-    def _check_inside(self) -> None:
+    def _check_inside(self, window: CurvedWindow) -> None:
         """Refuse what does not fit into the air that a round window encloses."""
         for where, camera in self.cameras.items():
-            if self.window.clearance_mm(camera.position_mm) <= 0:
+            if window.clearance_mm(camera.position_mm) <= 0:
                 raise ValueError(
                     f"{where}.position_mm = {list(camera.position_mm)} must lie inside the window's "
-                    f"{self.window.shape}, nearer than radius_mm = {self.window.radius_mm:.4g} to its axis or centre"
+                    f"{self.window.shape}, nearer than radius_mm = {window.radius_mm:.4g} to its axis or centre"
                 )
             if camera.aperture_mm:
                 raise ValueError(

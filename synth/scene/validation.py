@@ -16,6 +16,8 @@ Model = TypeVar("Model", bound=BaseModel)
 DISTRIBUTIONS = ("uniform", "normal", "log_uniform", "choice")
 _TAGS = ("kind", "shape")
 """Keys that tell the members of a union apart."""
+_UNNAMED = ("box", "plane")
+"""Shapes of tables that name none."""
 _LONGEST = 80
 """Characters of a given value that are shown."""
 
@@ -45,13 +47,16 @@ def _explain(problem: ErrorDetails, content: Any, at: str) -> str:
     where, given, context = _dotted(location, content), problem["input"], problem.get("ctx", {})
     match problem["type"]:
         case "extra_forbidden":
-            allowed = _keys(location[:-1])
-            close = get_close_matches(str(location[-1]), allowed, n=1)
+            key, (own, *others) = str(location[-1]), _members(location[:-1])
+            if owners := [repr(tag) for other in others if key in other.model_fields for tag in _tags_of(other)]:
+                return f"{where}: belongs to {' or '.join(owners)}, this is {_tags_of(own)[0]!r}"
+            allowed = list(own.model_fields)
+            close = get_close_matches(key, allowed, n=1)
             hint = f"did you mean {close[0]!r}?" if close else f"allowed here are {', '.join(allowed)}"
             return f"{where}: unknown key; {hint}"
         case "union_tag_invalid":
-            tag = context["discriminator"].strip("'")
-            return f"{where}.{tag} = {context['tag']!r}: allowed are {context['expected_tags']}"
+            tag = context["discriminator"].strip("'()")
+            return f"{where}.{tag} = {given[tag]!r}: allowed are {context['expected_tags']}"
         case "union_tag_not_found":
             return f"{where}: lacks the key {context['discriminator'].strip(chr(39))!r}{_distribution_hint(given)}"
         case "missing":
@@ -101,20 +106,25 @@ def _dotted(location: Sequence[int | str], content: Any) -> str:
 
 def _is_member(part: str, value: Any) -> bool:
     """Whether a part of pydantic's location names a member of the union that a value belongs to."""
-    return not isinstance(value, dict) or (part not in value and part in (value.get(tag) for tag in _TAGS))
+    if not isinstance(value, dict):
+        return True
+    return part not in value and part in (*_UNNAMED, *(value.get(tag) for tag in _TAGS))
 
 
-def _keys(location: Sequence[int | str]) -> list[str]:
-    """Keys that the schema knows in the table at a location."""
+def _members(location: Sequence[int | str]) -> list[type[BaseModel]]:
+    """The part of the schema at a location, before the other members of its union."""
     annotation: Any = Scene
+    others: list[type[BaseModel]] = []
     for part in location:
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            others = []
             annotation = annotation.model_fields[str(part)].annotation
         elif isinstance(part, int):
             annotation = get_args(annotation)[0]
         else:
-            annotation = next(member for member in get_args(annotation) if part in _tags_of(member))
-    return list(annotation.model_fields)
+            others = [getattr(member, "__origin__", member) for member in get_args(annotation)]
+            annotation = next(member for member in others if part in _tags_of(member))
+    return [annotation, *(other for other in others if other is not annotation)]
 
 
 def _tags_of(member: type[BaseModel]) -> tuple[str, ...]:

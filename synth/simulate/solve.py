@@ -13,7 +13,7 @@ from synth.press.load_path import LoadPath
 from synth.press.measure import Distance
 from synth.press.press import Press
 from synth.press.resolution import ELEMENTS
-from synth.scene import Gel, Scene
+from synth.scene import Gel, RoundGel, Scene
 from synth.simulate.direct import DirectPress
 from synth.simulate.material import pad_material
 from synth.simulate.options import STANDARD, SolverOptions
@@ -58,7 +58,7 @@ def simulate_press(
     share of the load path is done. InputError where the mesh is of another pad, or no element can be built on it.
     """
     gel, whole = press.scene.sensor.gel, space_of(press)
-    if not (gel.is_round and press.path.may_touch):
+    if not (isinstance(gel, RoundGel) and press.path.may_touch):
         return direct_press(press, frames, options, whole).run(on_progress)
     # A film pulls as far as its shear lag, √(E t h / G) with the gel's thickness h and G = E / 3 of the gel.
     film = sum(layer.youngs_modulus_kpa * layer.thickness_mm for layer in gel.layers) / gel.youngs_modulus_kpa

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from synth.arrays import FloatArray, Points
-from synth.scene import Window
+from synth.scene.window import CapsuleWindow, CylinderWindow, SphereWindow, Window
 
 _STEPS = 200
 """Most steps."""
@@ -38,11 +38,15 @@ class Shell:
     @staticmethod
     def of(window: Window) -> "Shell | None":
         """None for a flat window."""
-        if window.radius_mm is None:
-            return None
-        centre = window.center_z_mm
-        bottom = -np.inf if window.shape == "cylinder" or centre is None else centre
-        return Shell(window.radius_mm, bottom, bottom if window.shape == "sphere" else np.inf)
+        match window:
+            case SphereWindow():
+                return Shell(window.radius_mm, window.center_z_mm, window.center_z_mm)
+            case CylinderWindow():
+                return Shell(window.radius_mm, -np.inf, np.inf)
+            case CapsuleWindow():
+                return Shell(window.radius_mm, window.center_z_mm, np.inf)
+            case _:
+                return None
 
     def outwards(self, points: Points) -> Points:
         """Vectors (n, 3) from the nearest centres to points."""

@@ -7,7 +7,7 @@ import numpy as np
 from synth.arrays import FloatArray, Points
 from synth.flow.field import FlowField
 from synth.optics import Optics
-from synth.scene import Camera, Gel, Light, Mirror, NoPattern, Sensor, Window
+from synth.scene import BoxGel, Camera, Light, Mirror, NoPattern, PlaneWindow, Sensor
 from synth.surface import ContactFaces, GelSurface
 
 WIDTH, HEIGHT = 64, 48
@@ -31,8 +31,8 @@ def sensor(*, index: float = 1.0, mirrors: tuple[dict, ...] = (), **camera: obje
     """A 20 x 15 x 4 mm pad with a 5 mm window (outer face at z = 9) and a camera of 64 x 48 px."""
     given = {"width": WIDTH, "height": HEIGHT, "fx": 70.0, "fy": 71.0, "cx": 31.7, "cy": 24.4, **STRAIGHT, **camera}
     return Sensor(
-        gel=Gel(size_mm=(20, 15, 4), youngs_modulus_kpa=200),
-        window=Window(refractive_index=index, thickness_mm=5),
+        gel=BoxGel(size_mm=(20, 15, 4), youngs_modulus_kpa=200),
+        window=PlaneWindow(refractive_index=index, thickness_mm=5),
         pattern=NoPattern(kind="none"),
         lights=(Light(position_mm=(9, 0, 3), size_mm=(1, 1), color=(1, 1, 1), power=1),),
         camera=Camera(**given),

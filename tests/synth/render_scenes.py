@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from synth.arrays import Image, Points
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant, choose_variant
-from synth.scene import Camera, Coating, Gel, Light, NoPattern, Pattern, Render, Sensor, Window
+from synth.scene import BoxGel, Camera, Coating, Light, NoPattern, Pattern, PlaneWindow, Render, Sensor
 from synth.surface import GelSurface
 
 FAST = choose_variant("cpu")
@@ -28,8 +28,8 @@ def small_sensor(
     numbers |= {"position_mm": (0.2, -0.1, 20.0), "look_at_mm": (0.2, -0.1, 0.0)}
     light = Light(position_mm=(7.0, 2.0, 4.0), aim_mm=(0.0, 0.0, 0.0), size_mm=(0.05, 0.05), color=(1, 1, 1), power=100)
     return Sensor(
-        gel=Gel(size_mm=(12.0, 9.0, 3.0), youngs_modulus_kpa=200),
-        window=Window(refractive_index=index, thickness_mm=3.0),
+        gel=BoxGel(size_mm=(12.0, 9.0, 3.0), youngs_modulus_kpa=200),
+        window=PlaneWindow(refractive_index=index, thickness_mm=3.0),
         coating=Coating(reflectance=(0.6, 0.6, 0.6)),
         pattern=pattern or NoPattern(kind="none"),
         lights=lights or (light,),

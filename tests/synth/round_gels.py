@@ -5,7 +5,7 @@ import numpy as np
 from benchmarks.capsule_surface import capsule_surface
 from synth.arrays import Points
 from synth.mesh.capsule import CapsuleFace
-from synth.scene import Camera, Gel, Light, NoPattern, Sensor, Window
+from synth.scene import BoxGel, Camera, Light, NoPattern, Sensor
 from synth.surface import GelSurface
 
 RADIUS, LENGTH = 12.0, 8.0  # Of the coated face, mm: a hemisphere about (0, 0, RADIUS) and a cylinder above it
@@ -22,8 +22,8 @@ def sensor(window: dict, index: float = 1.45, lights: tuple[Light, ...] = (), **
     """A camera of 64 x 64 px and some 190 degrees of field, unless other numbers are given."""
     given = {"width": 64, "height": 64, "cx": 31.8, "cy": 32.3, **WIDE, **INSIDE, **camera}
     light = Light(position_mm=(10.0, 0.0, 14.0), size_mm=(0.5, 0.5), color=(1, 1, 1), power=1)
-    parts = {"gel": Gel(size_mm=(24, 24, 20), youngs_modulus_kpa=200), "pattern": NoPattern(kind="none")}
-    glass = Window(refractive_index=index, thickness_mm=1, **window)
+    parts = {"gel": BoxGel(size_mm=(24, 24, 20), youngs_modulus_kpa=200), "pattern": NoPattern(kind="none")}
+    glass = {"refractive_index": index, "thickness_mm": 1, **window}
     return Sensor(**parts, window=glass, lights=lights or (light,), camera=Camera(**given))
 
 

@@ -33,7 +33,7 @@ from synth.press.press import MeshRule
 from synth.press.scene_path import path_of
 from synth.render.chart import chart_of
 from synth.render.pattern import albedo
-from synth.scene import Gel, Scene
+from synth.scene import BoxGel, CapsuleGel, FileGel, Scene
 from synth.scene.gel_file import measured
 from synth.scene.part import Vector3
 from synth.scene.template import load_scene
@@ -119,9 +119,9 @@ def test_faces_at_rest_need_no_mesh(folder: Path) -> None:
     """Of a capsule, of its files with edges of .5 mm, and of a box's file, whose face is two triangles."""
     write(folder, "block.stl", block((10.0, 8.0, 4.0), 0.0))
     write(folder, "plate.stl", block((12.0, 11.0, 2.0), 3.0))
-    capsule = Gel(shape="capsule", radius_mm=5, thickness_mm=2, length_mm=2, youngs_modulus_kpa=200)
-    box = Gel(**{**FILE, "outer": "block.stl", "window": "plate.stl"}, size_mm=(10, 8, 4), thickness_mm=3)
-    files = Gel(**FILE, size_mm=(10, 10, 7), thickness_mm=2)
+    capsule = CapsuleGel(shape="capsule", radius_mm=5, thickness_mm=2, length_mm=2, youngs_modulus_kpa=200)
+    box = FileGel(**{**FILE, "outer": "block.stl", "window": "plate.stl"}, size_mm=(10, 8, 4), thickness_mm=3)
+    files = FileGel(**FILE, size_mm=(10, 10, 7), thickness_mm=2)
     for gel, area, most in ((capsule, 70 * np.pi, 1e-3), (files, 70 * np.pi, 5e-3), (box, 80.0, 1e-9)):
         found = rest_surface(gel, folder)
         # Chords of edges h on a radius R take h² / 8 R² = 1.3e-3 off a length, at edges of .5 mm.
@@ -243,11 +243,11 @@ def test_a_finger_of_55_mm_is_accepted_and_read_again(tmp_path: Path) -> None:
     write(tmp_path, "window.stl", capsule_body(8.0, 44.0, 4.0, 4.0))
     gel = from_files(capsule(), tmp_path).sensor.gel
     assert gel.size_mm[2] == pytest.approx(55.0, abs=1e-3)
-    built_in = Gel(shape="capsule", radius_mm=12.0, thickness_mm=3.0, length_mm=43.0, youngs_modulus_kpa=200.0)
+    built_in = CapsuleGel(shape="capsule", radius_mm=12.0, thickness_mm=3.0, length_mm=43.0, youngs_modulus_kpa=200.0)
     for each in (gel, built_in):
-        assert Gel.model_validate_json(each.model_dump_json()) == each
-    with pytest.raises(ValidationError, match="a pad's thickness, at most 50 mm"):
-        Gel(size_mm=(20.0, 20.0, 55.0), youngs_modulus_kpa=200.0)
+        assert type(each).model_validate_json(each.model_dump_json()) == each
+    with pytest.raises(ValidationError, match="less than or equal to 50"):
+        BoxGel(size_mm=(20.0, 20.0, 55.0), youngs_modulus_kpa=200.0)
 
 
 SCENE = """
@@ -311,7 +311,7 @@ def test_a_dataset_of_files_is_verified_without_them(folder: Path, tmp_path: Pat
 
 @pytest.mark.parametrize(("gel", "message"), [
     ({"outer": "none.stl"}, "there is no file"),
-    ({"unit": None}, "needs outer and window and unit"),
+    ({"unit": None}, "sensor.gel.unit: is missing"),
     ({"unit": "m"}, r"outer = 'outer.stl' is 1e\+04 mm long with unit = \"m\"; other units are mm, cm, inch"),
     ({"outer": "metres.stl", "window": "metres.stl"}, "is 0.01 mm long"),
     ({"outer": "open.stl"}, "outer = 'open.stl' has open edges"),

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,8 @@ from synth.dataset.reader import read_dataset
 from synth.dataset.sample_files import write_sample_files
 from synth.dataset.shard import Shard
 from synth.dataset.writer import DatasetWriter
+from synth.sampling import draw
+from synth.scene.template import load_scene
 
 PAIRS = 2  # Samples 0 1 | 2 3 | 4 5: with two shards, 0 and 1 and 4 and 5 are of shard 0/2, 2 and 3 of shard 1/2
 N = 6
@@ -55,6 +58,39 @@ def test_round_trip(tmp_path, dtype, grey):
     assert dataset.check_hashes(2) == []
     bits, channels = 8 * np.dtype(dtype).itemsize, 1 if grey else 3
     assert data.meta["image"] == {"width": 32, "height": 24, "channels": channels, "bits": bits}
+
+
+BEFORE = ("dome_radius_mm", "radius_mm", "thickness_mm", "outer", "window", "unit")
+"""Fields that a record of an earlier version has for all gels: null where they are another shape's."""
+
+
+@pytest.mark.parametrize(("name", "gel"), [
+    ("gelsight_mini", {}),
+    ("gelsight_mini", {"shape": "dome", "dome_radius_mm": 900.0}),
+    ("densetact", {"size_mm": [25.0, 25.0, 12.5]}),
+])  # fmt: skip
+def test_a_record_with_all_shapes_fields_is_the_same_scene(tmp_path: Path, name: str, gel: dict[str, Any]) -> None:
+    own = {key: value for key, value in gel.items() if key != "size_mm"}
+    scene = draw(load_scene(name, set=[f"sensor.gel.{key}={value}" for key, value in own.items()]), 0, 0)
+    path = write_dataset(tmp_path / "d", [translation_sample(2)]) / "samples/000002/meta.json"
+    record = {**json.loads(path.read_text()), "scene": json.loads(scene.model_dump_json())}
+    unused = {
+        **dict.fromkeys(BEFORE),
+        "length_mm": 0.0,
+        "cut_end": "free",
+        "rotation_deg": [0.0, 0.0, 0.0],
+        "digest": "",
+    }
+    record["scene"]["sensor"]["gel"] = {**unused, **record["scene"]["sensor"]["gel"], **gel}
+    record["scene"]["sensor"]["window"] = {
+        "radius_mm": None,
+        "center_z_mm": None,
+        **record["scene"]["sensor"]["window"],
+    }
+    path.write_text(json.dumps(record))
+    assert read_dataset(tmp_path / "d").scene_of(2) == scene
+    path.write_text(json.dumps(record).replace('"length_mm": 0.0', '"length_mm": 0.0, "hardness": 3'))
+    refused("its scene does not fit this version of synth", read_dataset(tmp_path / "d").scene_of, 2)
 
 
 def test_a_dataset_tells_its_job_passes_over_half_a_line_and_finds_tampering(tmp_path) -> None:

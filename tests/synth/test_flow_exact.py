@@ -11,7 +11,7 @@ from verified_sample import motion_checks, sheets
 from synth.flow.exact import exact_flow
 from synth.flow.view import View
 from synth.mesh import rest_surface
-from synth.scene import Gel, Window
+from synth.scene import DomeGel, PlaneWindow
 from synth.verify.motion import check_motion
 
 REST = rigid(np.eye(3), (0, 0, 0))
@@ -168,7 +168,7 @@ VIEWS = {
     "fisheye and mirrors": {"index": 1.45, "mirrors": double.SIDES, **double.FISHEYE, "fx": 35.0, "fy": 35.0},
 }
 
-DOME = Gel(shape="dome", size_mm=(20, 15, 8), youngs_modulus_kpa=200, dome_radius_mm=17.0)
+DOME = DomeGel(shape="dome", size_mm=(20, 15, 8), youngs_modulus_kpa=200, dome_radius_mm=17.0)
 """Slopes up to 47 degrees; 2.5 mm are left at its corners."""
 DOME_VIEWS = {
     "window": VIEWS["window"],
@@ -204,7 +204,7 @@ def test_flow_is_the_independent_projections(view):
 
 @pytest.mark.parametrize("view", DOME_VIEWS)
 def test_flow_of_a_dome_is_the_independent_projections(view):
-    window = Window(refractive_index=DOME_VIEWS[view]["index"], thickness_mm=1.0)
+    window = PlaneWindow(refractive_index=DOME_VIEWS[view]["index"], thickness_mm=1.0)
     domed, surface = sensor(**DOME_VIEWS[view]).model_copy(update={"gel": DOME, "window": window}), rest_surface(DOME)
     for first in (surface.material, dented(surface.material, 0.3)):
         flow = _agreed(domed, surface, first, dented(surface.material, 1.1, (0.8, -0.5)), 2e-6)  # of 16 px

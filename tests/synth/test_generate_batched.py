@@ -35,7 +35,7 @@ from synth.press.press import MeshRule, edge_radius_mm
 from synth.press.resolution import accuracy, shared_mesh, shared_spacing_mm
 from synth.render.variant import Variant
 from synth.sampling import MAX_DRAWS, draw, draw_sensor, sensor_of
-from synth.scene import Gel, Numerics, Scene
+from synth.scene import BoxGel, Numerics, Scene
 from synth.scene.template import Template, load_scene
 from synth.simulate.solve import simulate_press
 
@@ -52,7 +52,7 @@ BATCHED = (
 SAMPLES, SEED = 10, 9  # Five trajectories of three sensors and two pads; draws of every kind fail
 
 pytestmark = pytest.mark.usefixtures("one_cache")
-GEL = Gel(size_mm=(20.0, 15.0, 4.0), youngs_modulus_kpa=200.0)
+GEL = BoxGel(size_mm=(20.0, 15.0, 4.0), youngs_modulus_kpa=200.0)
 
 
 @pytest.fixture(scope="module")

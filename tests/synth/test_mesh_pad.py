@@ -24,12 +24,12 @@ from synth.mesh.tetrahedralise import (
     shape_quality,
     tetrahedralise_box,
 )
-from synth.scene import Gel, Layer, Numerics
+from synth.scene import BoxGel, Layer, Numerics
 
 SIZE = (7.0, 5.0, 2.5)
 EDGE = 0.6
 SOUND = brick((4.0, 3.0, 2.0), (2, 2, 2))
-GEL = Gel(size_mm=(4.0, 4.0, 3.0), youngs_modulus_kpa=200.0)
+GEL = BoxGel(size_mm=(4.0, 4.0, 3.0), youngs_modulus_kpa=200.0)
 NUMERICS = Numerics(edge_length_mm=1.5)
 WIDE = (12.0, 9.0, 3.0)
 FOCUS = Focus((1.5, -1.0), (2.0, 1.5))

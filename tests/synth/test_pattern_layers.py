@@ -22,7 +22,7 @@ from synth.pipeline.generate import generate
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant
-from synth.scene import Coating, Dots, Gel, Light, Mirror, NoPattern, Render, Sensor
+from synth.scene import Coating, DomeGel, Dots, Light, Mirror, NoPattern, Render, Sensor
 from synth.scene.template import load_scene
 from synth.surface import GelSurface
 
@@ -139,7 +139,7 @@ def _dotted(mirrors: tuple[Mirror, ...] = (), **camera: object) -> Sensor:
 
 
 def _domed(**camera: object) -> Sensor:
-    gel = Gel(shape="dome", size_mm=(14.0, 11.0, 5.0), youngs_modulus_kpa=200, dome_radius_mm=14.0)
+    gel = DomeGel(shape="dome", size_mm=(14.0, 11.0, 5.0), youngs_modulus_kpa=200, dome_radius_mm=14.0)
     sensor = _dotted(**camera)
     window = sensor.window.model_copy(update={"refractive_index": 1.41})
     return sensor.model_copy(update={"gel": gel, "window": window})

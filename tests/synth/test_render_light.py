@@ -14,7 +14,7 @@ from synth.render.gel_mesh import MIRROR
 from synth.render.lights import emitters, light_axes
 from synth.render.polygon_light import LightTable
 from synth.render.renderer import Renderer
-from synth.scene import Coating, Gel, Light, Render, Sensor
+from synth.scene import CapsuleGel, Coating, Light, Render, Sensor
 
 LIGHTS = tuple(Light(position_mm=(x, 1.0, 3.0), size_mm=(3, 1), color=(1, 1, 1), power=400) for x in (-7.0, 7.0))
 BLOCK = 10
@@ -134,7 +134,7 @@ def test_light_bounced_in_a_hemisphere_is_that_of_an_integrating_sphere() -> Non
     power, albedo, surface = 100.0, 0.6, capsule(2.4, length=0.0)
     place = {"position_mm": (3.0, 2.0, 11.9), "aim_mm": (3.0, 2.0, 0.0), "size_mm": (0.5, 0.5)}
     light = Light(**place, color=(1, 1, 1), power=power)
-    gel = Gel(shape="capsule", radius_mm=RADIUS, thickness_mm=2.0, youngs_modulus_kpa=200)
+    gel = CapsuleGel(shape="capsule", radius_mm=RADIUS, thickness_mm=2.0, youngs_modulus_kpa=200)
     within = sensor(SPHERE, index=1.0, lights=(light,), fx=30.0, fy=30.0, position_mm=(-3.0, 0.0, 11.0))
     within = within.model_copy(update={"gel": gel})
     renders = (Render(samples_per_pixel=64, light="separated", max_depth=depth) for depth in (2, 3))

@@ -191,8 +191,8 @@ def test_a_cylinder_is_open_at_its_ends_and_what_is_in_air_is_seen_straight():
 
 
 @pytest.mark.parametrize(("window", "camera", "words"), [
-    ({"shape": "sphere", "radius_mm": 9.0}, {}, "needs center_z_mm"),
-    ({"radius_mm": 9.0}, {}, "has no radius_mm"),
+    ({"shape": "sphere", "radius_mm": 9.0}, {}, "center_z_mm"),
+    ({"radius_mm": 9.0}, {}, "radius_mm"),
     (CAPSULE, {"position_mm": (0.0, 0.0, 2.5)}, "must lie inside the window's capsule"),
     (SPHERE, {"lens": "pinhole", "distortion": (0.0,) * 5, "aperture_mm": 1.0, "focus_mm": 9.0}, "only a pinhole"),
 ])  # fmt: skip
