@@ -103,9 +103,11 @@ def test_a_call_that_a_device_cannot_record_is_made_as_it_is(on_device, monkeypa
     for name in ("current_stream", "Stream", "CUDAGraph"):
         monkeypatch.setattr(torch.cuda, name, lambda *_: Nothing())
     monkeypatch.setattr(torch.cuda, "stream", lambda _: nullcontext())
+    set_again: list[object] = []
+    monkeypatch.setattr(torch.cuda, "set_stream", set_again.append)
     monkeypatch.setattr(torch.cuda, "graph", refused)
     run, doubled = Recorder(), lambda factor, field: (factor * field,)
     with pytest.warns(UserWarning, match="no CUDA graph could be recorded: operation not permitted") as warned:
         found = [on_device(run, doubled, 2, torch.full((2,), float(number)))[0] for number in range(4)]
-    assert len(warned) == 1
+    assert len(warned) == len(set_again) == 1  # the device goes on with the stream that it had
     assert torch.stack(found)[:, 0].tolist() == [0, 2, 4, 6]

@@ -69,7 +69,7 @@ def test_the_same_press_by_motion_and_by_poses_gives_the_same_states(
         "indenter": indenter,
         "friction": 0.4,
         "numerics": {"tolerance": 1e-11},
-        "gel": {"shape": "dome" if dome else "box", "dome_radius_mm": dome},
+        "gel": {"shape": "dome", "dome_radius_mm": dome} if dome else {},
     }
     mesh = domed(MESH, dome)
     by_motion = complete(scene(**parts, motion=motion), mesh)
