@@ -17,18 +17,21 @@ That is exact for any number of reflections, and images of lights are sampled li
 one by chance.
 """
 
+import math
 from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.arrays import FloatArray
+from synth.arrays import FloatArray, Points
 from synth.errors import InputError
 from synth.optics import Optics
 from synth.optics.window import Window
 from synth.render.gel_mesh import MIRROR, mirrored
 from synth.scene import Light, Sensor, Vector3
+
+ACROSS = 32
 
 
 def emitters(lights: tuple[Light, ...], mi: Any) -> dict[str, Any]:
@@ -97,22 +100,28 @@ def light_axes(light: Light) -> FloatArray:
 def check_view(sensor: Sensor) -> None:
     """Refuse lights that the camera would see: they would hide gel that the flow says is visible."""
     optics = Optics.of(sensor)
-    across = np.linspace(-0.5, 0.5, 33)
-    u, v = (axis.ravel() for axis in np.meshgrid(across, across))
-    for i, light in enumerate(sensor.lights):
-        first, second, _ = light_axes(light)
-        points = (
-            np.array(light.position_mm) + np.outer(u * light.size_mm[0], first) + np.outer(v * light.size_mm[1], second)
+    lit = [_places(light) for light in sensor.lights]
+    points = np.concatenate([np.zeros((0, 3)), *lit])
+    numbers = np.repeat(np.arange(len(lit)), [len(places) for places in lit])
+    shown = optics.window.shows(points)
+    pixels = optics.project(points[shown])
+    inside = optics.is_inside(pixels)
+    if inside.any():
+        i, (x, y) = numbers[shown][inside][0], pixels[inside][0]
+        raise InputError(
+            f"sensor.lights[{i}] at position_mm = {list(sensor.lights[i].position_mm)} stands between the camera and "
+            f"the gel (at pixel {x:.0f}, {y:.0f}): move it out of the camera's view, or check that fx, fy, cx and cy "
+            "are in pixels of this width and height"
         )
-        pixels = optics.project(points[optics.window.shows(points)])
-        inside = optics.is_inside(pixels)
-        if inside.any():
-            x, y = pixels[inside][0]
-            raise InputError(
-                f"sensor.lights[{i}] at position_mm = {list(light.position_mm)} stands between the camera and the gel "
-                f"(at pixel {x:.0f}, {y:.0f}): move it out of the camera's view, or check that fx, fy, cx and cy "
-                "are in pixels of this width and height"
-            )
+
+
+def _places(light: Light) -> Points:
+    """(n, 3) places on a light: ACROSS steps along its longer side, and as long ones along the other."""
+    first, second, _ = light_axes(light)
+    step = max(light.size_mm) / ACROSS
+    sides = (np.linspace(-size / 2, size / 2, 1 + math.ceil(size / step)) for size in light.size_mm)
+    u, v = (axis.ravel() for axis in np.meshgrid(*sides))
+    return np.asarray(light.position_mm + np.outer(u, first) + np.outer(v, second))
 
 
 def reaches(light: Light, size_mm: Vector3) -> bool:
