@@ -131,7 +131,7 @@ class LoadSteps:
 
         Ends the press, saying so.
         """
-        if target != self._path.press_mm or not self._path.is_over(self._size_mm) or (yield Do.FORCE) > FORCE_FLOOR:
+        if target != self._path.press_mm or (yield Do.FORCE) > FORCE_FLOOR or not self._path.is_over(self._size_mm):
             return False
         self._reason = no_contact(target)
         return True
