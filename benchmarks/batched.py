@@ -11,6 +11,7 @@ displacement, and of the force. That is done by the solver for one sample, which
 """
 
 import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
@@ -31,7 +32,7 @@ from synth.simulate import simulate
 from synth.simulate.batched.gpu import dense
 from synth.simulate.batched.krylov import RUNNING, WAITING
 from synth.simulate.batched.pad import Pad, prepare
-from synth.simulate.batched.run import OPTIONS, Run
+from synth.simulate.batched.run import OPTIONS, Run, simulate_presses
 from synth.simulate.batched.solver import INNER_ITERATIONS
 
 PLACES_MM = (6.0, 4.0)
@@ -83,12 +84,11 @@ def rate(case: Row, device: str) -> Row:
     scenes = [random_ball(rng, case) for _ in range(max(DRAWS, case["batch"]))]
     options = replace(OPTIONS, forcing=case["forcing"], relaxed_tolerance=case["relaxed"], closer=case["closer"])
     presses = enumerate(cycle([(Press.of(scene, pad.space.mesh), None) for scene in scenes]))
-    next(iter(Run(list(islice(presses, 1)), iter([]), pad, options)))  # compiles the kernels
-    run = Run(list(islice(presses, case["batch"])), presses, pad, options, case["inner"])
+    list(simulate_presses([press for _, press in islice(presses, 1)], pad, 1, options))  # compiles the kernels
     began = time.perf_counter()
     ends: list[float] = []
     complete = iterations = 0
-    for _, result in run:
+    for _, result in simulate_presses((press for _, press in presses), pad, case["batch"], options):
         ends.append(time.perf_counter() - began)
         complete += result.status == "complete"
         iterations += sum(state.newton_iterations for state in result.states)
@@ -100,8 +100,7 @@ def rate(case: Row, device: str) -> Row:
         "complete": complete,
         "presses_per_s": round(steady(ends, case["batch"]), 2),
         "newton_per_press": round(iterations / len(ends), 2),
-        "ms_per_cycle": round(1e3 * ends[-1] / run.cycles, 3),
-        **profile(run, device),
+        **profile(Run(deque(islice(presses, case["batch"])), presses, case["batch"], pad, options), device),
     }
 
 
@@ -112,7 +111,9 @@ def steady(ends: Sequence[float], batch: int) -> float:
 
 
 def profile(run: Run, device: str) -> Row:
-    """What PROFILED_CYCLES cycles spend on each part of the solver, ms a cycle."""
+    """What cycles of a run spend on each part of the solver, ms a cycle, after some that are not counted."""
+    for _ in range(PROFILED_CYCLES):
+        list(run.turn())
     krylov = run.solver.krylov
     clock = Events(device) if wp.get_device(device).is_cuda else Clock()
     parts: dict[str, float] = {}
@@ -121,12 +122,12 @@ def profile(run: Run, device: str) -> Row:
         before = np.where(krylov.running.numpy() == RUNNING, krylov.k.numpy(), 0)
         clock.start()
         run.solver.watch = clock.mark
-        run.advance()
+        list(run.turn())
         run.solver.watch = None
         for part, ms in clock.stop():
             parts[part] = parts.get(part, 0.0) + ms / PROFILED_CYCLES
         used += int(np.where(krylov.running.numpy() != WAITING, krylov.k.numpy() - before, 0).sum())
-    busy = used / (PROFILED_CYCLES * run.solver.inner * run.solver.batch)
+    busy = used / (PROFILED_CYCLES * INNER_ITERATIONS * run.solver.batch)
     return {"krylov_busy": round(busy, 3), **{f"ms_{part}": round(ms, 4) for part, ms in parts.items()}}
 
 
@@ -239,7 +240,6 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--relaxed", type=float, default=OPTIONS.relaxed_tolerance, help="of intermediate steps")
     parser.add_argument("--closer", type=float, default=OPTIONS.closer, help="tolerance of passes over the scene's")
     parser.add_argument("--step", type=float, help="mm; longest load step, default as in scenes")
-    parser.add_argument("--inner", type=int, default=INNER_ITERATIONS, help="Krylov iterations of a cycle")
     parser.add_argument("--errors", type=int, metavar="N", help="instead: surface errors of the first N presses")
     parser.add_argument("--across", type=int, default=10, help="elements across a contact in the reference")
     given = parser.parse_args(argv)
@@ -255,13 +255,13 @@ def main(argv: list[str]) -> int:
         show(rows, ["press", "radius_mm", "surface_error_percent", "force_error_percent", "status"], press["cells"])
         return 0 if all("surface_error_percent" in row for row in rows) else 1
     name = wp.get_device(given.device).name
-    press |= {"forcing": given.forcing, "closer": given.closer, "inner": given.inner, "seconds": given.seconds}
+    press |= {"forcing": given.forcing, "closer": given.closer, "seconds": given.seconds}
     cases = [
         {"processor": name, **press, "batch": batch, "run": run} for batch in given.batch for run in range(given.runs)
     ]
     rows = measure(given.out / "batched.csv", cases, partial(rate, device=given.device))
-    columns = ["batch", "run", "presses_per_s", "newton_per_press", "ms_per_cycle", "presses", "complete"]
+    columns = ["batch", "run", "presses_per_s", "newton_per_press", "presses", "complete"]
     show(rows, columns, f"{name}, {press['cells']} cells")
-    parts = [key for key in rows[0] if key.startswith("ms_") and key != "ms_per_cycle"]
+    parts = [key for key in rows[0] if key.startswith("ms_")]
     show(rows, ["batch", "run", *parts, "krylov_busy"], "ms a cycle, by part")
     return 0

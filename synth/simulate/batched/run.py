@@ -1,8 +1,8 @@
-"""Many presses through the lanes of one solver: the entry point, and what the host does."""
+"""Many presses through the lanes of two solvers that take turns: the entry point, and what the host does."""
 
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -14,7 +14,7 @@ from synth.simulate.batched.lane import Lane
 from synth.simulate.batched.lane_orders import Number
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.presses import trajectory
-from synth.simulate.batched.solver import INNER_ITERATIONS, BatchedSolver
+from synth.simulate.batched.solver import BatchedSolver
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.policy.load_steps import LoadSteps
 from synth.simulate.solve import check_shared
@@ -22,6 +22,9 @@ from synth.simulate.trajectory import Trajectory, at_rest
 
 Asked = tuple[Press, frozenset[int] | None]
 """A press, and the numbers of the states that are wanted of it, else all."""
+Numbered = tuple[int, Asked]
+RUNS = 2
+"""Runs that take turns: a GPU is at work on one's lanes while the host leads the other's."""
 MAX_BATCH = 512
 AHEAD = 8
 """Presses that wait for a lane, at most: more than end in a cycle, and few enough to be made beside its work."""
@@ -40,106 +43,111 @@ def simulate_presses(
     `synth.simulate.batched.pad.prepare`. At most `batch` trajectories run at a time, and an iterator is asked for a few
     more whenever some have ended, even if it had none the last time. `options` hold along the load paths.
     """
-    numbered = map(partial(_checked, pad), enumerate(asked))
-    waiting = list(islice(numbered, batch))
-    while waiting:
-        run = Run(waiting, numbered, pad, options)
-        yield from run
-        waiting = [*run.waiting, *islice(numbered, batch - len(run.waiting))]
+    more, waiting = map(partial(_checked, pad), enumerate(asked)), deque[Numbered]()
+    runs: list[Run | None] = [None] * min(RUNS, batch)
+    lanes = batch // len(runs)
+    while True:
+        for k, run in enumerate(runs):
+            if run is None:
+                waiting += islice(more, max(0, lanes - len(waiting)))
+                if not waiting or (len(waiting) < lanes and any(runs)):
+                    continue
+                run = Run(waiting, more, lanes, pad, options)
+            yield from run.turn()
+            runs[k] = run if any(run.lanes) else None
+        if not any(runs):
+            waiting += islice(more, 0 if waiting else 1)
+            if not waiting:
+                return
 
 
-def _checked(pad: Pad, numbered: tuple[int, Asked]) -> tuple[int, Asked]:
+def _checked(pad: Pad, numbered: Numbered) -> Numbered:
     check_shared([pad.scene, numbered[1][0].scene], pad.space.mesh)
     return numbered
 
 
 class Run:
-    """Presses, by their numbers, in the lanes of a solver: the first ones, as many as there are lanes, and then more.
+    """Presses in the lanes of a solver: those that are `waiting`, at most so many at a time, and then `more`.
 
-    The first ones say how many states a lane can record, and how large a distance grid can be. `waiting` are presses
-    that have not begun; if one needs more room, the run ends with it still waiting.
+    The first ones say how many states a lane can record, and how large a distance grid can be. If one needs more room,
+    the run ends with it still waiting. `lanes` are those of the solver, None where no press is under way.
     """
 
     def __init__(
-        self,
-        first: Sequence[tuple[int, Asked]],
-        more: Iterator[tuple[int, Asked]],
-        pad: Pad,
-        options: SolverOptions,
-        inner: int = INNER_ITERATIONS,
+        self, waiting: deque[Numbered], more: Iterator[Numbered], lanes: int, pad: Pad, options: SolverOptions
     ) -> None:
-        self._more, self._pad, self._options = more, pad, options
-        self.waiting = deque(first)
-        batch = len(first)
-        self._room = tuple(np.max([_room(press) for _, (press, _) in first], axis=0).tolist())
+        self._waiting, self._more, self._pad, self._options = waiting, more, pad, options
+        batch = min(lanes, len(waiting))
+        self._room = tuple(np.max([_room(press) for _, (press, _) in islice(waiting, batch)], axis=0).tolist())
         records, *grid = self._room
-        self.solver = BatchedSolver(pad, batch, records, (grid[0], grid[1], grid[2]), inner)
+        self.solver = BatchedSolver(pad, batch, records, (grid[0], grid[1], grid[2]))
         self._orders = np.zeros(batch, dtype=np.int32)
         self._numbers = np.zeros((batch, len(Number)))
-        self._presses: list[Press] = [press for _, (press, _) in first]
+        self._presses: list[Press] = [press for _, (press, _) in islice(waiting, batch)]
         self.lanes: list[Lane | None] = [None] * batch
-        self.cycles = 0
-        self._untouched: list[tuple[int, Trajectory]] = []
+        self._begun, self._spent = np.zeros(batch), 0.0
 
-    def __iter__(self) -> Iterator[tuple[int, Trajectory]]:
-        """Run all presses."""
-        begun, spent = np.zeros(self.solver.batch), 0.0
-        while True:
-            began = time.perf_counter()
-            begun[self._fill()] = spent
-            untouched, self._untouched = self._untouched, []
-            yield from untouched
-            if not any(self.lanes):
-                return
-            ended = self.advance()
-            over = [(s, lane, self.solver.recorded(s, len(lane.records))) for s, lane in ended]
-            spent += time.perf_counter() - began  # without what whoever takes the results does meanwhile
-            for s, lane, fields in over:
-                self.lanes[s] = None
-                seconds = float(spent - begun[s]) / self.solver.batch
-                result = trajectory(self._presses[s], lane.records, fields, lane.reason, seconds, self._pad.space)
-                yield lane.press, result
+    def turn(self) -> Iterator[tuple[int, Trajectory]]:
+        """Wait for the cycle that is under way, begin presses in lanes that have ended, and begin a cycle.
 
-    def advance(self) -> list[tuple[int, Lane]]:
-        """One cycle, and what the lanes are told to do in the next; the lanes that have ended, with their numbers."""
-        self.solver.begin_cycle(self._orders, self._numbers)
-        if len(self.waiting) < min(AHEAD, self.solver.batch):  # while a GPU is at work
-            self.waiting += islice(self._more, 1)
-        seen = self.solver.seen().tolist()
-        self.cycles += 1
+        What has ended is made ready, and may be used, beside it.
+        """
+        began = time.perf_counter()
+        over = [(s, lane, self.solver.recorded(s, len(lane.records))) for s, lane in self._ended()]
+        results = [(self._presses[s], lane, fields, float(self._begun[s])) for s, lane, fields in over]
+        for s, *_ in over:
+            self.lanes[s] = None
+        untouched = self._fill()
+        if any(self.lanes):
+            self.solver.begin_cycle(self._orders, self._numbers)
+        self._spent += time.perf_counter() - began  # without what whoever takes the results does meanwhile
+        yield from untouched
+        for press, lane, fields, begun in results:
+            seconds = (self._spent - begun) / self.solver.batch
+            yield lane.press, trajectory(press, lane.records, fields, lane.reason, seconds, self._pad.space)
+
+    def _ended(self) -> list[tuple[int, Lane]]:
+        """Wait for the cycle, if there is one, and ask what the lanes are to do next; those that have ended."""
         working = [(s, lane) for s, lane in enumerate(self.lanes) if lane is not None]
+        if not working:
+            return []
+        if len(self._waiting) < min(AHEAD, self.solver.batch):  # while a GPU is at work
+            self._waiting += islice(self._more, 1)
+        seen = self.solver.seen().tolist()
         ended = [(s, lane) for s, lane in working if lane.ended]
         for s, lane in working:  # a lane that ends now still has orders for the next cycle
             self._orders[s] = 0 if lane.ended else lane.advance(seen[s])
         return ended
 
-    def _fill(self) -> list[int]:
-        """Begin presses in empty lanes; these lanes."""
+    def _fill(self) -> list[tuple[int, Trajectory]]:
+        """Begin presses in empty lanes; results of those that touch nothing."""
         begun: dict[int, Press] = {}
+        untouched: list[tuple[int, Trajectory]] = []
         for s in (s for s, lane in enumerate(self.lanes) if lane is None):
-            asked = self._next()
+            asked = self._next(untouched)
             if asked is None:
                 break
             number, (press, frames) = asked
             lane = Lane(number, self._steps(press, frames), self._numbers[s], self._options.forcing)
             begun[s], self.lanes[s], self._orders[s], self._presses[s] = press, lane, lane.first, press
+            self._begun[s] = self._spent
         if begun:
             self.solver.fill(begun)
-        return list(begun)
+        return untouched
 
-    def _next(self) -> tuple[int, Asked] | None:
+    def _next(self, untouched: list[tuple[int, Trajectory]]) -> Numbered | None:
         """The next press that touches the gel, if there is room for it; those that do not are over at once."""
         while True:
-            self.waiting += islice(self._more, 0 if self.waiting else 1)
-            if not self.waiting:
+            self._waiting += islice(self._more, 0 if self._waiting else 1)
+            if not self._waiting:
                 return None
-            number, (press, _) = self.waiting[0]
+            number, (press, _) = self._waiting[0]
             if press.path.may_touch:
                 fits = all(needs <= there for needs, there in zip(_room(press), self._room, strict=True))
-                return self.waiting.popleft() if fits else None
-            self.waiting.popleft()
+                return self._waiting.popleft() if fits else None
+            self._waiting.popleft()
             rest = tuple(at_rest(press.path, self._pad.space))
-            self._untouched.append((number, Trajectory(rest, "", 0.0, self._pad.space)))
+            untouched.append((number, Trajectory(rest, "", 0.0, self._pad.space)))
 
     def _steps(self, press: Press, wanted: frozenset[int] | None) -> LoadSteps:
         scene, mesh = press.scene, press.mesh

@@ -51,15 +51,14 @@ class BatchedSolver:
     """See the module's docstring.
 
     A trajectory records at most `records` states; `grid` are the counts of the largest distance grid of the indenters.
-    `inner` are the Krylov iterations of a cycle.
     """
 
-    def __init__(self, pad: Pad, batch: int, records: int, grid: tuple[int, int, int], inner: int) -> None:
+    def __init__(self, pad: Pad, batch: int, records: int, grid: tuple[int, int, int]) -> None:
         space, material, device = pad.space, pad.material, pad.device
         self.pad, self.batch, self.device = pad, batch, device
         rows = pad.preconditioner.rows
         self._bulk, self._faces = bulk_tables(space, material, pad.mixed, device), face_tables(space, device)
-        self.inner, self._table = inner, PressTable(batch, device)
+        self._table = PressTable(batch, device)
         self._presses = self._table.on_device()
         self._barrier = barrier_tables(space, material, device)
         self._rows = number_rows(space, pad.free, rows, self._bulk, device)
@@ -77,6 +76,10 @@ class BatchedSolver:
         """Called after each launch with the part of the cycle and the kernel's name, for profiles."""
         self._part = ""
         self._is_warm, self._graph = False, None
+        cuda = wp.get_device(device).is_cuda
+        self._seen = wp.empty_like(self._arrays.seen, device="cpu", pinned=cuda)
+        self._ended = wp.Event(device) if cuda else None
+        self._aside = wp.Stream(device) if cuda else None
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], *arguments: Any, block: int = 256) -> None:
         wp.launch(kernel, dim, inputs=list(arguments), device=self.device, block_dim=block)
@@ -105,10 +108,15 @@ class BatchedSolver:
         self._launch(lane_orders.viscosities, self.batch, a.numbers, a.viscosity)
         self._launch(lane_orders.place_indenters, self.batch, a.orders, a.numbers, self._presses, a.indenters)
         self._solve_and_evaluate()
+        wp.copy(self._seen, a.seen)
+        if self._ended is not None:
+            wp.get_stream(self.device).record_event(self._ended)
 
     def seen(self) -> FloatArray:
         """Wait for the end of the cycle; (B, k) what the lanes have seen, by the columns of `lane_orders.Seen`."""
-        return np.asarray(self._arrays.seen.numpy())
+        if self._ended is not None:
+            wp.synchronize_event(self._ended)
+        return np.asarray(self._seen.numpy())
 
     def _solve_and_evaluate(self) -> None:
         """What every cycle does; on CUDA a graph that is captured the second time, when all kernels are loaded."""
@@ -129,7 +137,7 @@ class BatchedSolver:
         a = self._arrays
         self._launch(lane_orders.select, self.batch, a.orders, int(Order.SOLVE), a.mask)
         self._linearise()
-        for _ in range(self.inner):
+        for _ in range(INNER_ITERATIONS):
             self._iterate()
         self._part = "krylov"
         self._launch_blocks(self._solution, self._block, a.krylov, a.seen)
@@ -264,5 +272,13 @@ class BatchedSolver:
         self._launch(fields.clear_contact, a.points, a.mask, a.contact)
 
     def recorded(self, lane: int, count: int) -> FloatArray:
-        """The first states that a lane has recorded, a copy: its next press writes into the same memory."""
-        return np.array(self._arrays.records[lane].numpy()[:count])
+        """The first states that a lane has recorded, a copy: its next press writes into the same memory.
+
+        It does not wait for the cycle of another solver.
+        """
+        records = self._arrays.records[lane][: max(count, 1)]
+        found = wp.empty_like(records, device="cpu")
+        wp.copy(found, records, stream=self._aside)
+        if self._aside is not None:
+            wp.synchronize_stream(self._aside)
+        return np.asarray(found.numpy()[:count])
