@@ -35,7 +35,7 @@ def drawn(case: Row, settings: Sequence[str] = ()) -> tuple[Press, frozenset[int
     seed, number = case["seed"], case["trajectory"]
     try:
         scene = draw(template, seed, number)
-        press = MeshRule.of(scene).press(scene, template.source.parent)
+        press = MeshRule.of(scene, case["device"] == "cuda").press(scene, template.source.parent)
     except InputError as error:
         return str(error)
     pairs = samples_of(template, seed, number, scene.motion.steps)
@@ -47,7 +47,7 @@ def tries(case: Row, press: Press) -> Iterator[Press]:
     yield press
     for scene in blunter(press):
         with suppress(InputError):
-            yield MeshRule.of(scene).press(scene, load_scene(case["scene"]).folder)
+            yield MeshRule.of(scene, case["device"] == "cuda").press(scene, load_scene(case["scene"]).folder)
 
 
 def found(result: Trajectory, shown: frozenset[int], rounder: int) -> Row:

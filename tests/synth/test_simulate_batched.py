@@ -226,6 +226,8 @@ def test_scenes_must_share_the_pad_which_serves_several_runs() -> None:
     for other in (scene(gel=soft), scene(gel=stiffening), scene(numerics=short)):
         refused("must share the gel's materials and all numerics", simulate_scenes, [scene(), other], MESH)
         refused("must share", list, simulate_presses([(Press.of(other, MESH), None)], pad))
+    finer = Press.of(scene(), brick(counts=(6, 4, 2)))
+    refused("must share a mesh", list, simulate_presses([(finer, None)], pad))
     posed = scene(friction=0.4, motion={"depth_mm": 0.2})
     pad, presses = prepare(posed, MESH, "cpu"), [(Press.of(posed, MESH), None)]
     (_, one), (_, other) = (next(simulate_presses(presses, pad)) for _ in range(2))

@@ -9,6 +9,7 @@ from itertools import islice
 
 import numpy as np
 
+from synth.errors import InputError
 from synth.press.press import Press
 from synth.simulate.batched.lane import Lane
 from synth.simulate.batched.lane_orders import Number
@@ -39,7 +40,7 @@ def simulate_presses(
     """Simulate presses into pads of one mesh, each as if it were alone; their numbers and trajectories, as they end.
 
     A press comes with the numbers of the states that are wanted, see `synth.simulate.simulate_press`. The presses share
-    the pad's materials and, but for the penalty, its numerics, else InputError; the pad is of
+    the pad's mesh, materials and, but for the penalty, its numerics, else InputError; the pad is of
     `synth.simulate.batched.pad.prepare`. At most `batch` trajectories run at a time, and an iterator is asked for a few
     more whenever some have ended, even if it had none the last time. `options` hold along the load paths.
     """
@@ -62,7 +63,10 @@ def simulate_presses(
 
 
 def _checked(pad: Pad, numbered: Numbered) -> Numbered:
-    check_shared([pad.scene, numbered[1][0].scene], pad.space.mesh)
+    press, mesh = numbered[1][0], pad.space.mesh
+    check_shared([pad.scene, press.scene], mesh)
+    if not np.array_equal(press.mesh.points, mesh.points):
+        raise InputError("the presses of a batch must share a mesh")
     return numbered
 
 
