@@ -10,7 +10,7 @@ from pads import SIZE, brick, scene
 
 from synth.press.press import Press
 from synth.simulate.batched import krylov as kernels
-from synth.simulate.batched.gpu import dense, inverse
+from synth.simulate.batched.gpu import dense, inverse, unit_rows
 from synth.simulate.batched.krylov import Krylov, arnoldi, block_size, flat, padded, round_rows
 from synth.simulate.batched.lane import Lane
 from synth.simulate.batched.lane_orders import Number, Order, Seen, select
@@ -181,6 +181,12 @@ def test_dense_operations_on_a_gpu(rows: int, batch: int) -> None:
     true = x[some].astype(np.float64) @ a.astype(np.float64)
     off = np.linalg.norm(product.numpy()[some] - true, axis=1) / np.linalg.norm(true, axis=1)
     assert (off < 4e-9 * rows).all()
+
+
+def test_right_sides_of_an_inverse_are_unit_vectors() -> None:
+    """A full block of them, and what is left over at the end."""
+    for count, first in ((4, 0), (4, 4), (2, 8)):
+        np.testing.assert_array_equal(unit_rows(count, 10, first, wp.get_device("cpu")), np.eye(count, 10, first))
 
 
 @pytest.mark.cuda

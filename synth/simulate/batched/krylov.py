@@ -286,3 +286,15 @@ def round_rows(rows: wp.array2d(dtype=wp.float64), first: int, matrix: wp.array2
     """Rows of a matrix, from a first one on; one thread per number."""
     i, j = wp.tid()
     matrix[first + i, j] = rounded(wp.float32(rows[i, j]))
+
+
+@wp.kernel
+def scatter(
+    row: wp.array(dtype=wp.int32),
+    column: wp.array(dtype=wp.int32),
+    value: wp.array(dtype=wp.float64),
+    matrix: wp.array2d(dtype=wp.float64),
+):
+    """The entries of a sparse matrix in a dense one; one thread per entry that is stored."""
+    i = wp.tid()
+    matrix[row[i], column[i]] = value[i]
