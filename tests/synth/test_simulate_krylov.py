@@ -34,7 +34,7 @@ def _systems(batch: int, device: str = "cpu") -> tuple[Krylov, list[Any]]:
 
 def test_lanes_are_selected_by_their_orders() -> None:
     orders, mask = (wp.array(values, dtype=wp.int32, device="cpu") for values in (np.arange(8), np.zeros(8)))
-    wp.launch(select, 8, inputs=[orders, int(Order.RESTORE_PASS | Order.REPEAT), mask], device="cpu")
+    wp.launch(select, 8, inputs=[orders, Order.RESTORE_PASS | Order.REPEAT, mask], device="cpu")
     assert mask.numpy().tolist() == [0, 0, 1, 1, 1, 1, 1, 1]
 
 

@@ -4,14 +4,8 @@ from typing import Any
 
 import warp as wp
 
-from synth.simulate.batched.lane_orders import RATIO, SHARE, Order
+from synth.simulate.batched.lane_orders import Number, Order
 from synth.simulate.contact_friction import FAR, ContactState
-
-TAKE, KEEP_STEP, KEEP_PASS = (wp.constant(int(o)) for o in (Order.TAKE, Order.KEEP_STEP, Order.KEEP_PASS))
-RESTORE_STEP, ACCEPT, BEGIN, PREDICT, TRY = (
-    wp.constant(int(o)) for o in (Order.RESTORE_STEP, Order.ACCEPT, Order.BEGIN, Order.PREDICT, Order.TRY)
-)
-BACK_TO_PASS = wp.constant(int(Order.RESTORE_PASS | Order.REPEAT))
 
 
 @wp.struct
@@ -82,8 +76,8 @@ def compute_trial(
     if mask[s] == 0:
         return
     scale = wp.float64(0.0)
-    if (orders[s] & TRY) != 0:
-        scale = numbers[s, SHARE]
+    if (orders[s] & Order.TRY) != 0:
+        scale = numbers[s, Number.SHARE]
     if found[s] == 1:
         scale = wp.float64(1.0)
     count = fields.state_u.shape[1]
@@ -106,7 +100,7 @@ def compute_trial(
 
 @wp.kernel
 def apply_predictor(
-    orders: wp.array(dtype=wp.int32),
+    mask: wp.array(dtype=wp.int32),
     share: wp.float64,
     step: wp.array2d(dtype=wp.float32),
     node_row: wp.array(dtype=wp.int32),
@@ -115,7 +109,7 @@ def apply_predictor(
 ):
     """One thread per (lane, node and then pressure): the first iterate, the state and 1/share times step."""
     s, i = wp.tid()
-    if (orders[s] & PREDICT) == 0:
+    if mask[s] == 0:
         return
     count = fields.state_u.shape[1]
     if i < count:
@@ -141,24 +135,24 @@ def _to_solution(
     before_pass: wp.array2d(dtype=Any),
 ):
     x = iterate[s, i]
-    if (order & TAKE) != 0:
+    if (order & Order.TAKE) != 0:
         x = trial[s, i]
-    if (order & BACK_TO_PASS) != 0:
+    if (order & (Order.RESTORE_PASS | Order.REPEAT)) != 0:
         x = before_pass[s, i]
     iterate[s, i] = x
-    if (order & KEEP_STEP) != 0:
+    if (order & Order.KEEP_STEP) != 0:
         after_step[s, i] = x
-    if (order & KEEP_PASS) != 0:
+    if (order & Order.KEEP_PASS) != 0:
         before_pass[s, i] = x
 
 
 @wp.kernel
-def to_solution(orders: wp.array(dtype=wp.int32), f: Fields):
+def to_solution(mask: wp.array(dtype=wp.int32), orders: wp.array(dtype=wp.int32), f: Fields):
     """One thread per (lane, node and then pressure): the iterate that a solve has ended with, and snapshots of it."""
     s, i = wp.tid()
-    order = orders[s]
-    if (order & (TAKE | BACK_TO_PASS | KEEP_STEP | KEEP_PASS)) == 0:
+    if mask[s] == 0:
         return
+    order = orders[s]
     count = f.state_u.shape[1]
     if i < count:
         _to_solution(order, s, i, f.iterate_u, f.trial_u, f.after_step_u, f.before_pass_u)
@@ -178,12 +172,12 @@ def _to_start(
     after_step: wp.array2d(dtype=Any),
 ):
     x = iterate[s, i]
-    if (order & RESTORE_STEP) != 0:
+    if (order & Order.RESTORE_STEP) != 0:
         x = after_step[s, i]
-    if (order & ACCEPT) != 0:
+    if (order & Order.ACCEPT) != 0:
         previous[s, i] = state[s, i]
         state[s, i] = x
-    if (order & BEGIN) != 0:
+    if (order & Order.BEGIN) != 0:
         x = state[s, i]
         if ratio != wp.float64(0.0):
             x += ratio * (x - previous[s, i])
@@ -191,13 +185,15 @@ def _to_start(
 
 
 @wp.kernel
-def to_start(orders: wp.array(dtype=wp.int32), numbers: wp.array2d(dtype=wp.float64), f: Fields):
+def to_start(
+    mask: wp.array(dtype=wp.int32), orders: wp.array(dtype=wp.int32), numbers: wp.array2d(dtype=wp.float64), f: Fields
+):
     """One thread per (lane, node and then pressure): the end of a step is accepted, and the next one begins."""
     s, i = wp.tid()
-    order = orders[s]
-    if (order & (RESTORE_STEP | ACCEPT | BEGIN)) == 0:
+    if mask[s] == 0:
         return
-    count, ratio = f.state_u.shape[1], numbers[s, RATIO]
+    order = orders[s]
+    count, ratio = f.state_u.shape[1], numbers[s, Number.RATIO]
     if i < count:
         _to_start(order, ratio, s, i, f.state_u, f.previous_u, f.iterate_u, f.after_step_u)
     else:

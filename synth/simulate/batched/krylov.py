@@ -20,10 +20,9 @@ from functools import cache
 
 import warp as wp
 
-from synth.simulate.batched.lane_orders import GOAL, NORM, STICKING, Seen
+from synth.simulate.batched.lane_orders import Number, Order, Seen
 from synth.simulate.linear import GMRES_LIMIT
 
-SEEN_DONE, SEEN_FINITE = wp.constant(int(Seen.DONE)), wp.constant(int(Seen.FINITE))
 WAITING, RUNNING, DONE = wp.constant(0), wp.constant(1), wp.constant(2)
 LIMIT = wp.constant(GMRES_LIMIT)
 ZERO = wp.constant(wp.float32(0.0))
@@ -120,7 +119,7 @@ def begin_vectors(
     s, i = wp.tid()
     if mask[s] == 0:
         return
-    size = numbers[s, NORM]
+    size = numbers[s, Number.NORM]
     moves = 3 * force.shape[1]
     found = wp.vec4f()
     for k in range(4):
@@ -142,12 +141,12 @@ def begin_solve(mask: wp.array(dtype=wp.int32), numbers: wp.array2d(dtype=wp.flo
     s = wp.tid()
     if mask[s] == 0:
         return
-    krylov.goal[s] = wp.float32(numbers[s, GOAL])
-    krylov.size[s] = numbers[s, NORM]
+    krylov.goal[s] = wp.float32(numbers[s, Number.GOAL])
+    krylov.size[s] = numbers[s, Number.NORM]
     krylov.k[s] = 0
     krylov.residual[s, 0] = ONE
     krylov.running[s] = RUNNING
-    if numbers[s, NORM] == wp.float64(0.0):
+    if numbers[s, Number.NORM] == wp.float64(0.0):
         krylov.running[s] = DONE
 
 
@@ -225,7 +224,7 @@ def solution(rows: int) -> wp.Kernel:
     def finish(krylov: Krylov, seen: wp.array2d(dtype=wp.float64)):
         s, thread = wp.tid()
         if thread == 0:
-            seen[s, SEEN_DONE] = wp.float64(0.0)
+            seen[s, Seen.DONE] = wp.float64(0.0)
         if krylov.running[s] != DONE:
             return
         k = krylov.k[s]
@@ -248,8 +247,8 @@ def solution(rows: int) -> wp.Kernel:
             wp.tile_axpy(weight, z, total)
         wp.tile_store(krylov.step[s], total * wp.float32(krylov.size[s]), bounds_check=False)
         if thread == 0:
-            seen[s, SEEN_DONE] = wp.float64(1.0)
-            seen[s, SEEN_FINITE] = wp.float64(finite)
+            seen[s, Seen.DONE] = wp.float64(1.0)
+            seen[s, Seen.FINITE] = wp.float64(finite)
 
     return finish
 
@@ -261,7 +260,7 @@ def release(krylov: Krylov, orders: wp.array(dtype=wp.int32), found: wp.array(dt
     found[s] = 0
     if krylov.running[s] == DONE:
         krylov.running[s] = WAITING
-        found[s] = wp.where((orders[s] & STICKING) != 0, 0, 1)
+        found[s] = wp.where((orders[s] & Order.STICKING) != 0, 0, 1)
 
 
 HALF, KEPT = wp.constant(wp.uint32(0x1000)), wp.constant(wp.uint32(0xFFFFE000))

@@ -5,7 +5,7 @@ policies of all lanes want of a cycle is gathered into one set of bits and one r
 is launched once for all lanes that want the same. The order in which a cycle does what it is told is that of the bits.
 """
 
-from enum import IntEnum, IntFlag
+from enum import IntEnum
 
 import warp as wp
 
@@ -13,8 +13,11 @@ from synth.simulate.contact_friction import Indenters
 from synth.simulate.policy import requests
 
 
-class Order(IntFlag):
-    """What a lane is to do in a cycle, in this order; see `synth.simulate.policy.requests`."""
+class Order:
+    """What a lane is to do in a cycle, in this order; see `synth.simulate.policy.requests`.
+
+    Integers, since Python takes long to combine flags of an Enum.
+    """
 
     TAKE = 1 << 0
     RESTORE_PASS = 1 << 1  # the iterate and its multipliers
@@ -45,11 +48,6 @@ class Seen(IntEnum):
     """Columns of what a lane answers with: the parts of an Evaluation, and of a linear solve."""
 
     FREE, FORCES, REACTION, JACOBIAN, DEEPEST, MOVED, ERROR, FORCE, DONE, FINITE = range(10)
-
-
-AT, RATIO, SHARE, VISCOSITY, STIFFENING, NORM, GOAL, RECORD = (wp.constant(int(n)) for n in Number)
-STICKING, AUGMENT = wp.constant(int(Order.STICKING)), wp.constant(int(Order.AUGMENT))
-EVALUATED = wp.constant(int(Order.EVALUATE | Order.TRY))
 
 
 @wp.struct
@@ -87,7 +85,7 @@ def select(orders: wp.array(dtype=wp.int32), wanted: int, mask: wp.array(dtype=w
 def select_evaluated(orders: wp.array(dtype=wp.int32), found: wp.array(dtype=wp.int32), mask: wp.array(dtype=wp.int32)):
     """1 for lanes that are to be evaluated or tried, or whose direction was found in this cycle."""
     s = wp.tid()
-    mask[s] = wp.where((orders[s] & EVALUATED) != 0 or found[s] == 1, 1, 0)
+    mask[s] = wp.where((orders[s] & (Order.EVALUATE | Order.TRY)) != 0 or found[s] == 1, 1, 0)
 
 
 @wp.kernel
@@ -96,13 +94,13 @@ def augmented_shares(
 ):
     """(B,) share of the update of multipliers, 0 where there is none."""
     s = wp.tid()
-    shares[s] = wp.where((orders[s] & AUGMENT) != 0, numbers[s, SHARE], wp.float64(0.0))
+    shares[s] = wp.where((orders[s] & Order.AUGMENT) != 0, numbers[s, Number.SHARE], wp.float64(0.0))
 
 
 @wp.kernel
 def viscosities(numbers: wp.array2d(dtype=wp.float64), viscosity: wp.array(dtype=wp.float64)):
     s = wp.tid()
-    viscosity[s] = numbers[s, VISCOSITY]
+    viscosity[s] = numbers[s, Number.VISCOSITY]
 
 
 STICK_FRICTION = wp.constant(wp.float64(requests.STICK_FRICTION))
@@ -129,7 +127,7 @@ def _corner(presses: Presses, j: int, s: wp.float64) -> wp.vec4d:
 def set_stiffness(numbers: wp.array2d(dtype=wp.float64), presses: Presses, indenters: Indenters):
     """The contact stiffness, so many times the body's own."""
     s = wp.tid()
-    indenters.sharpness[s] = numbers[s, STIFFENING] * presses.sharpness[s]
+    indenters.sharpness[s] = numbers[s, Number.STIFFENING] * presses.sharpness[s]
 
 
 @wp.kernel
@@ -143,7 +141,7 @@ def place_indenters(
     i = wp.tid()
     if presses.legs[i] == 0:
         return
-    pose = _corner(presses, i, numbers[i, AT])
+    pose = _corner(presses, i, numbers[i, Number.AT])
     place = presses.position[i]
     local = wp.vec3d(place[0] + pose[1], place[1] + pose[2], pose[0] - presses.reach[i])
     indenters.centre[i] = presses.origin[i] + presses.axes[i] * local
@@ -154,5 +152,5 @@ def place_indenters(
     turn = wp.mat33d(c, -n, zero, n, c, zero, zero, zero, wp.float64(1.0))
     indenters.rotation[i] = presses.axes[i] * (turn * presses.rotation[i])
     indenters.friction[i] = presses.friction[i]
-    if (orders[i] & STICKING) != 0:
+    if (orders[i] & Order.STICKING) != 0:
         indenters.friction[i] = STICK_FRICTION

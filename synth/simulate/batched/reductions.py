@@ -3,7 +3,7 @@
 import warp as wp
 
 from synth.simulate.batched.fields import Fields, node_step
-from synth.simulate.batched.lane_orders import NORM, RECORD, SHARE, Order, Seen
+from synth.simulate.batched.lane_orders import Number, Order, Seen
 from synth.simulate.contact_friction import Faces, Indenters, position
 
 BLOCK = 256
@@ -12,8 +12,6 @@ SLIPS = wp.constant(wp.float64(1.0 - 1.0e-6))
 """Share of the friction limit from which a point counts as slipping, as in `System.slip_ratio`."""
 SCALARS = wp.constant(8)
 """A record's numbers before its fields: force (3), moment (3), touching and slipping area."""
-FREE, FORCES, REACTION, JACOBIAN, DEEPEST, MOVED, ERROR, FORCE, DONE, FINITE = (wp.constant(int(n)) for n in Seen)
-TRY = wp.constant(int(Order.TRY))
 
 
 @wp.struct
@@ -62,12 +60,12 @@ def residual_norms(
     farthest = wp.tile_extract(wp.tile_max(wp.tile(farthest)), 0)
     held = wp.tile_extract(wp.tile_sum(wp.tile(held)), 0)
     if thread == 0:
-        seen[s, FREE] = wp.sqrt(free)
-        seen[s, FORCES] = wp.sqrt(whole)
-        seen[s, REACTION] = wp.sqrt(held)
-        seen[s, JACOBIAN] = smallest
-        seen[s, MOVED] = wp.sqrt(farthest)
-        seen[s, DEEPEST] = wp.float64(0.0)
+        seen[s, Seen.FREE] = wp.sqrt(free)
+        seen[s, Seen.FORCES] = wp.sqrt(whole)
+        seen[s, Seen.REACTION] = wp.sqrt(held)
+        seen[s, Seen.JACOBIAN] = smallest
+        seen[s, Seen.MOVED] = wp.sqrt(farthest)
+        seen[s, Seen.DEEPEST] = wp.float64(0.0)
 
 
 @wp.kernel
@@ -91,9 +89,9 @@ def relaxation_errors(
     if mask[s] == 0:
         return
     part = wp.float64(1.0)
-    if (orders[s] & TRY) != 0:
-        part = numbers[s, SHARE]
-    left = (wp.float64(1.0) - part) * numbers[s, NORM]
+    if (orders[s] & Order.TRY) != 0:
+        part = numbers[s, Number.SHARE]
+    left = (wp.float64(1.0) - part) * numbers[s, Number.NORM]
     total = wp.float64(0.0)
     for i in range(thread, force.shape[1], wp.block_dim()):
         row = node_row[i]
@@ -104,7 +102,7 @@ def relaxation_errors(
         total += rest * rest
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
     if thread == 0:
-        seen[s, ERROR] = wp.sqrt(total) / numbers[s, NORM]
+        seen[s, Seen.ERROR] = wp.sqrt(total) / numbers[s, Number.NORM]
 
 
 @wp.kernel
@@ -125,7 +123,7 @@ def penetrations(mask: wp.array(dtype=wp.int32), gap: wp.array3d(dtype=wp.float6
     for q in range(gap.shape[2]):
         deepest = wp.max(deepest, -gap[s, f, q])
     if deepest > wp.float64(0.0):
-        wp.atomic_max(seen, s, DEEPEST, deepest)
+        wp.atomic_max(seen, s, Seen.DEEPEST, deepest)
 
 
 @wp.kernel
@@ -180,7 +178,7 @@ def press_forces(
     s = wp.tid()
     if mask[s] == 1:
         a = axes[s]
-        seen[s, FORCE] = sums[s, 0] * a[0, 2] + sums[s, 1] * a[1, 2] + sums[s, 2] * a[2, 2]
+        seen[s, Seen.FORCE] = sums[s, 0] * a[0, 2] + sums[s, 1] * a[1, 2] + sums[s, 2] * a[2, 2]
 
 
 @wp.kernel
@@ -200,7 +198,7 @@ def write_record(
     s, i = wp.tid()
     if mask[s] == 0:
         return
-    r = int(numbers[s, RECORD])
+    r = int(numbers[s, Number.RECORD])
     if i == 0:
         for k in range(8):
             records[s, r, k] = sums[s, k]
@@ -227,7 +225,7 @@ def write_tractions(
     s, f = wp.tid()
     if mask[s] == 0 or surface.number[f, 0] < 0:
         return
-    r = int(numbers[s, RECORD])
+    r = int(numbers[s, Number.RECORD])
     for a in range(surface.number.shape[1]):
         share = wp.vec3d()
         for q in range(surface.hat.shape[0]):

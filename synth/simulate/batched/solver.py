@@ -127,7 +127,7 @@ class BatchedSolver:
 
     def _launch_all(self) -> None:
         a = self._arrays
-        self._launch(lane_orders.select, self.batch, a.orders, int(Order.SOLVE), a.mask)
+        self._launch(lane_orders.select, self.batch, a.orders, Order.SOLVE, a.mask)
         self._linearise()
         for _ in range(self.inner):
             self._iterate()
@@ -136,7 +136,7 @@ class BatchedSolver:
         self._launch(gmres.release, self.batch, a.krylov, a.orders, a.found)
         self._evaluate()
 
-    def _told(self, *orders: Order) -> bool:
+    def _told(self, *orders: int) -> bool:
         """Whether any lane is told any of these; which ones is then the mask."""
         wanted = sum(orders)
         if not self._wanted & wanted:
@@ -149,7 +149,7 @@ class BatchedSolver:
         a, self._part = self._arrays, "stepping"
         contact, before = (a.contact.normal, a.contact.tangent), (a.normal_before, a.tangent_before)
         if self._told(Order.TAKE, Order.RESTORE_PASS, Order.REPEAT, Order.KEEP_STEP, Order.KEEP_PASS):
-            self._launch(fields.to_solution, self._value_dim, a.orders, a.fields)
+            self._launch(fields.to_solution, self._value_dim, a.mask, a.orders, a.fields)
         if self._told(Order.RESTORE_PASS):
             self._launch(fields.copy_multipliers, a.points, a.mask, *before, *contact)
         if self._told(Order.KEEP_STEP):
@@ -176,12 +176,12 @@ class BatchedSolver:
             self._launch(fields.copy_memory, a.points, a.mask, a.saved, a.memory)
         self._launch(lane_orders.set_stiffness, self.batch, a.numbers, self._presses, a.indenters)
         if self._told(Order.RESTORE_STEP, Order.ACCEPT, Order.BEGIN):
-            self._launch(fields.to_start, self._value_dim, a.orders, a.numbers, a.fields)
+            self._launch(fields.to_start, self._value_dim, a.mask, a.orders, a.numbers, a.fields)
         if self._told(Order.ACCEPT):
             self._update_contact_history(a.fields.state_u, 0)
         if self._told(Order.PREDICT):
             where = (self._rows.node_row, self._rows.pressure_row, a.fields)
-            self._launch(fields.apply_predictor, self._value_dim, a.orders, PATH_DERIVATIVE_STEP, a.step, *where)
+            self._launch(fields.apply_predictor, self._value_dim, a.mask, PATH_DERIVATIVE_STEP, a.step, *where)
         if self._told(Order.AUGMENT):
             self._launch(lane_orders.augmented_shares, self.batch, a.orders, a.numbers, a.shares)
             self._launch(augment, a.points, a.shares, a.indenters, a.gap, a.tangential, PENALTY, a.contact)
