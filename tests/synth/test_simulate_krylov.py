@@ -142,9 +142,8 @@ def test_a_preconditioner_takes_tf32_from_the_first_vector_on() -> None:
     krylov, told = _systems(2)
     rows = flat(krylov.current).shape[1]
     free = np.append(np.arange(150), np.full(rows - 150, -1)).astype(np.int32)
-    force = wp.array(rng.standard_normal((2, 50, 3)), dtype=wp.vec3d, device="cpu")
-    volume = wp.zeros((2, 0), dtype=wp.float64, device="cpu")
-    inputs = [*told, wp.array(free, device="cpu"), force, volume, krylov]
+    residual = wp.array(rng.standard_normal((2, 150)), dtype=wp.float64, device="cpu")
+    inputs = [*told, wp.array(free, device="cpu"), residual, krylov]
     wp.launch(kernels.begin_vectors, (2, rows // 4), inputs=inputs, device="cpu")
     first = flat(krylov.current).numpy().copy()
     flat(krylov.product).assign(rng.standard_normal((2, rows)).astype(np.float32))

@@ -273,7 +273,7 @@ def test_a_state_without_balance_to_the_full_tolerance_leaves_no_trace(monkeypat
     rejected = []
 
     def memory() -> list[np.ndarray]:
-        held = (fields.state_u, fields.state_p, contact.anchored, contact.anchor, contact.normal, contact.tangent)
+        held = (fields.state, contact.anchored, contact.anchor, contact.normal, contact.tangent)
         return [array.numpy().copy() for array in held]
 
     def look(part: str, kernel: str) -> None:

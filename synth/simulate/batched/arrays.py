@@ -5,7 +5,7 @@ zero. Most of the memory is contact's and the Krylov basis.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -34,16 +34,20 @@ class BatchArrays:
         def zeros(shape: int | tuple[int, ...], dtype: Any) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        nodes, pressures, elements = len(space.points), space.pressures if pad.mixed else 0, len(space.nodes)
+        self.nodes, elements = len(space.points), len(space.nodes)
+        values = (batch, 3 * self.nodes + (space.pressures if pad.mixed else 0))
         self.points = (batch, len(space.faces), len(space.element.face_weights))
         self.orders, self.numbers = zeros(batch, wp.int32), zeros((batch, len(Number)), wp.float64)
         self.seen = zeros((batch, len(Seen)), wp.float64)
         self.viscosity, self.shares = zeros(batch, wp.float64), zeros(batch, wp.float64)
-        self.fields: Fields = zeros_of(Fields, lambda n: (batch, nodes if n.endswith("_u") else pressures), device)
+        self.fields: Fields = zeros_of(Fields, lambda _: values, device)
+        self.residual, self.viscous = zeros(values, wp.float64), zeros(values, wp.float64)
+        self.state, self.iterate, self.trial, self.forces, self.viscous_forces = (
+            by_node(each, self.nodes)
+            for each in (self.fields.state, self.fields.iterate, self.fields.trial, self.residual, self.viscous)
+        )
         self.contact: ContactState = zeros_of(ContactState, lambda _: self.points, device)
         self.saved: ContactMemory = zeros_of(ContactMemory, lambda _: self.points, device)
-        self.force, self.volume = zeros((batch, nodes), wp.vec3d), zeros((batch, pressures), wp.float64)
-        self.viscous = zeros((batch, nodes), wp.vec3d)
         self.jacobian = zeros((batch, elements), wp.float64)
         self.gap, self.tangential = zeros(self.points, wp.float64), zeros(self.points, wp.vec3d)
         self.memory = ContactMemory()
@@ -55,7 +59,7 @@ class BatchArrays:
         self.indenters: Indenters = zeros_of(
             Indenters, lambda name: (batch, *grid) if name == "coefficients" else (batch,), device
         )
-        self.records = zeros((batch, records, SCALARS + 3 * nodes + 3 * len(space.surface_nodes)), wp.float64)
+        self.records = zeros((batch, records, SCALARS + 3 * self.nodes + 3 * len(space.surface_nodes)), wp.float64)
         self.sums = zeros((batch, 8), wp.float64)
         self.mask, self.found = zeros(batch, wp.int32), zeros(batch, wp.int32)
         stored = (elements, len(space.element.weights), STORED_YEOH if pad.yeoh else STORED, batch)
@@ -69,20 +73,37 @@ class BatchArrays:
         self.step = flat(self.krylov.step)
 
 
+class ByNode(NamedTuple):
+    """Views of values (B, 3 n + k): displacements, or forces, `u` (B, n) of vec3d, and `p` (B, k)."""
+
+    u: wp.array
+    p: wp.array
+
+
+def by_node(values: wp.array, nodes: int) -> ByNode:
+    """These views, which do not keep the values alive."""
+    lanes, pressures = len(values), values.shape[1] - 3 * nodes
+    row, device = values.strides[0], values.device
+    u = wp.array(ptr=values.ptr, dtype=wp.vec3d, shape=(lanes, nodes), strides=(row, 24), device=device)
+    p = wp.array(
+        ptr=values.ptr + 24 * nodes, dtype=wp.float64, shape=(lanes, pressures), strides=(row, 8), device=device
+    )
+    return ByNode(u, p)
+
+
 @dataclass(frozen=True)
 class UnknownRows:
     """See the module's docstring; Warp arrays.
 
     Attributes:
         free: (rows,) number of the unknown, displacements of all nodes first; -1 where there is none.
-        node_row: (n,) first row of a node, -1 where it is held. pressure_row: (k,).
+        row: (3 n + k,) the other way round; -1 where the unknown is held.
         face_row: (f, ns) first rows of a face's nodes. face_shape: (nq, ns) float32.
         single: tables of the elements.
     """
 
     free: wp.array
-    node_row: wp.array
-    pressure_row: wp.array
+    row: wp.array
     face_row: wp.array
     face_shape: wp.array
     single: SingleTables
@@ -108,8 +129,7 @@ def number_rows(space: Space, free: np.ndarray, rows: int, bulk: Bulk, device: s
     shapes = {name: getattr(bulk, name).numpy() for name in ("gradient", "pressure_shape", "stabilisation")}
     return UnknownRows(
         free=warp_array(padded, wp.int32, device),
-        node_row=warp_array(moving[:, 0], wp.int32, device),
-        pressure_row=warp_array(pressure_row, wp.int32, device),
+        row=warp_array(row, wp.int32, device),
         face_row=warp_array(moving[space.faces, 0], wp.int32, device),
         face_shape=warp_array(element.face_shape.astype(np.float32), wp.float32, device),
         single=struct_of(SingleTables, device, **rows_of, **shapes),

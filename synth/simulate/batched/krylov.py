@@ -108,29 +108,22 @@ def begin_vectors(
     mask: wp.array(dtype=wp.int32),
     numbers: wp.array2d(dtype=wp.float64),
     free: wp.array(dtype=wp.int32),
-    force: wp.array2d(dtype=wp.vec3d),
-    volume: wp.array2d(dtype=wp.float64),
+    residual: wp.array2d(dtype=wp.float64),
     krylov: Krylov,
 ):
     """One thread per (lane, four rows): the first basis vector, minus the residual over its norm.
 
-    free: (rows,) number of the unknown, displacements of all nodes first, or -1 for rows that fill up.
+    free: (rows,) number of the value in a residual (B, 3 n + k), or -1 for rows that fill up.
     """
     s, i = wp.tid()
     if mask[s] == 0:
         return
     size = numbers[s, Number.NORM]
-    moves = 3 * force.shape[1]
     found = wp.vec4f()
     for k in range(4):
         unknown = free[4 * i + k]
         if unknown >= 0 and size > wp.float64(0.0):
-            value = wp.float64(0.0)
-            if unknown < moves:
-                value = -force[s, unknown // 3][unknown % 3] / size
-            else:
-                value = -volume[s, unknown - moves] / size
-            found[k] = wp.float32(value)
+            found[k] = wp.float32(-residual[s, unknown] / size)
     krylov.basis[s, 0, i] = found
     krylov.current[s, i] = rounded_four(found)
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synth.simulate.batched.fields import Fields, node_step
+from synth.simulate.batched.fields import Fields, node_value
 from synth.simulate.batched.lane_orders import Number, Order, Seen
 from synth.simulate.contact_friction import Faces, Indenters, position
 
@@ -26,14 +26,17 @@ class SurfaceTables:
 @wp.kernel
 def residual_norms(
     mask: wp.array(dtype=wp.int32),
-    force: wp.array2d(dtype=wp.vec3d),
-    volume: wp.array2d(dtype=wp.float64),
+    residual: wp.array2d(dtype=wp.float64),
+    nodes: int,
     jacobian: wp.array2d(dtype=wp.float64),
-    node_row: wp.array(dtype=wp.int32),
+    row: wp.array(dtype=wp.int32),
     fields: Fields,
     seen: wp.array2d(dtype=wp.float64),
 ):
-    """One block per lane: norms of the free residual, all forces and those on held nodes, smallest det F, moved."""
+    """One block per lane: norms of the free residual, all forces and those on held nodes, smallest det F, moved.
+
+    row: of each value in Krylov vectors, -1 where it is held.
+    """
     s, thread = wp.tid()
     if mask[s] == 0:
         return
@@ -42,16 +45,17 @@ def residual_norms(
     held = wp.float64(0.0)
     smallest = wp.float64(1.0e30)
     farthest = wp.float64(0.0)
-    for i in range(thread, force.shape[1], wp.block_dim()):
-        farthest = wp.max(farthest, wp.length_sq(fields.trial_u[s, i] - fields.before_pass_u[s, i]))
-        square = wp.length_sq(force[s, i])
+    for i in range(thread, nodes, wp.block_dim()):
+        moved = node_value(fields.trial, s, i) - node_value(fields.before_pass, s, i)
+        farthest = wp.max(farthest, wp.length_sq(moved))
+        square = wp.length_sq(node_value(residual, s, i))
         whole += square
-        if node_row[i] >= 0:
+        if row[3 * i] >= 0:
             free += square
         else:
             held += square
-    for i in range(thread, volume.shape[1], wp.block_dim()):
-        free += volume[s, i] * volume[s, i]
+    for i in range(3 * nodes + thread, residual.shape[1], wp.block_dim()):
+        free += residual[s, i] * residual[s, i]
     for i in range(thread, jacobian.shape[1], wp.block_dim()):
         smallest = wp.min(smallest, jacobian[s, i])
     free = wp.tile_extract(wp.tile_sum(wp.tile(free)), 0)
@@ -71,11 +75,10 @@ def residual_norms(
 @wp.kernel
 def relaxation_errors(
     mask: wp.array(dtype=wp.int32),
-    force: wp.array2d(dtype=wp.vec3d),
-    viscous: wp.array2d(dtype=wp.vec3d),
-    volume: wp.array2d(dtype=wp.float64),
-    node_row: wp.array(dtype=wp.int32),
-    pressure_row: wp.array(dtype=wp.int32),
+    residual: wp.array2d(dtype=wp.float64),
+    nodes: int,
+    viscous: wp.array2d(dtype=wp.float64),
+    row: wp.array(dtype=wp.int32),
     right: wp.array2d(dtype=wp.float32),
     orders: wp.array(dtype=wp.int32),
     numbers: wp.array2d(dtype=wp.float64),
@@ -93,12 +96,13 @@ def relaxation_errors(
         part = numbers[s, Number.SHARE]
     left = (wp.float64(1.0) - part) * numbers[s, Number.NORM]
     total = wp.float64(0.0)
-    for i in range(thread, force.shape[1], wp.block_dim()):
-        row = node_row[i]
-        if row >= 0:
-            total += wp.length_sq(force[s, i] + viscous[s, i] + left * node_step(right, s, row))
-    for i in range(thread, volume.shape[1], wp.block_dim()):
-        rest = volume[s, i] + left * wp.float64(right[s, pressure_row[i]])
+    for i in range(thread, nodes, wp.block_dim()):
+        first = row[3 * i]
+        if first >= 0:
+            before = wp.vec3d(wp.vec3f(right[s, first], right[s, first + 1], right[s, first + 2]))
+            total += wp.length_sq(node_value(residual, s, i) + node_value(viscous, s, i) + left * before)
+    for i in range(3 * nodes + thread, residual.shape[1], wp.block_dim()):
+        rest = residual[s, i] + left * wp.float64(right[s, row[i]])
         total += rest * rest
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
     if thread == 0:
@@ -185,12 +189,12 @@ def press_forces(
 def write_record(
     mask: wp.array(dtype=wp.int32),
     numbers: wp.array2d(dtype=wp.float64),
-    u: wp.array2d(dtype=wp.vec3d),
+    iterate: wp.array2d(dtype=wp.float64),
+    nodes: int,
     sums: wp.array2d(dtype=wp.float64),
-    surface: int,
     records: wp.array3d(dtype=wp.float64),
 ):
-    """One thread per (lane, node): a record's scalars and displacement, and zeros for its tractions.
+    """One thread per (lane, number of a record): its scalars and displacement, and zeros for its tractions.
 
     records: (B, R, SCALARS + 3 n + 3 surface): force, moment, areas, then the displacement of all nodes and the
     traction at the surface's nodes.
@@ -199,16 +203,12 @@ def write_record(
     if mask[s] == 0:
         return
     r = int(numbers[s, Number.RECORD])
-    if i == 0:
-        for k in range(8):
-            records[s, r, k] = sums[s, k]
-    first = SCALARS + 3 * i
-    for k in range(3):
-        records[s, r, first + k] = u[s, i][k]
-    if i < surface:
-        first = SCALARS + 3 * u.shape[1] + 3 * i
-        for k in range(3):
-            records[s, r, first + k] = wp.float64(0.0)
+    if i < SCALARS:
+        records[s, r, i] = sums[s, i]
+    elif i < SCALARS + 3 * nodes:
+        records[s, r, i] = iterate[s, i - SCALARS]
+    else:
+        records[s, r, i] = wp.float64(0.0)
 
 
 @wp.kernel

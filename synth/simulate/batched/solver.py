@@ -72,7 +72,7 @@ class BatchedSolver:
         self._arrays = BatchArrays(pad, batch, records, grid)
         self.krylov = self._arrays.krylov
         self._element_dim, self._face_dim = (batch, len(space.nodes)), self._arrays.points[:2]
-        self._value_dim = (batch, len(space.points) + self._arrays.volume.shape[1])
+        self._value_dim = self._arrays.residual.shape
         self.watch: Callable[[str, str], None] | None = None
         """Called after each launch with the part of the cycle and the kernel's name, for profiles."""
         self._part = ""
@@ -155,18 +155,18 @@ class BatchedSolver:
         if self._told(Order.KEEP_STEP):
             self._launch(fields.copy_memory, a.points, a.mask, a.memory, a.saved)
         if self._told(Order.ANCHOR):
-            self._update_contact_history(a.fields.iterate_u, 1)
+            self._update_contact_history(a.iterate.u, 1)
         if self._told(Order.KEEP_PASS):
             self._launch(fields.copy_multipliers, a.points, a.mask, *contact, *before)
         if self._told(Order.FORCE, Order.RECORD):
             self._launch(reductions.clear_sums, a.sums.shape, a.mask, a.sums)
-            found = (a.fields.iterate_u, self._faces, a.indenters, a.traction, a.tangential)
+            found = (a.iterate.u, self._faces, a.indenters, a.traction, a.tangential)
             self._launch(reductions.contact_forces, self._face_dim, a.mask, *found, a.sums)
             self._launch(reductions.press_forces, self.batch, a.mask, self._presses.axes, a.sums, a.seen)
         if self._told(Order.RECORD):
-            u, surface = a.fields.iterate_u, len(self.pad.space.surface_nodes)
-            self._launch(reductions.write_record, u.shape, a.mask, a.numbers, u, a.sums, surface, a.records)
-            where = (self._faces, self._surface, a.traction, u.shape[1])
+            written, size = (a.fields.iterate, a.nodes, a.sums, a.records), (self.batch, a.records.shape[2])
+            self._launch(reductions.write_record, size, a.mask, a.numbers, *written)
+            where = (self._faces, self._surface, a.traction, a.nodes)
             self._launch(reductions.write_tractions, self._face_dim, a.mask, a.numbers, *where, a.records)
 
     def _begin_steps(self) -> None:
@@ -178,10 +178,10 @@ class BatchedSolver:
         if self._told(Order.RESTORE_STEP, Order.ACCEPT, Order.BEGIN):
             self._launch(fields.to_start, self._value_dim, a.mask, a.orders, a.numbers, a.fields)
         if self._told(Order.ACCEPT):
-            self._update_contact_history(a.fields.state_u, 0)
+            self._update_contact_history(a.state.u, 0)
         if self._told(Order.PREDICT):
-            where = (self._rows.node_row, self._rows.pressure_row, a.fields)
-            self._launch(fields.apply_predictor, self._value_dim, a.mask, PATH_DERIVATIVE_STEP, a.step, *where)
+            where = (PATH_DERIVATIVE_STEP, a.step, self._rows.row, a.fields)
+            self._launch(fields.apply_predictor, self._value_dim, a.mask, *where)
         if self._told(Order.AUGMENT):
             self._launch(lane_orders.augmented_shares, self.batch, a.orders, a.numbers, a.shares)
             self._launch(augment, a.points, a.shares, a.indenters, a.gap, a.tangential, PENALTY, a.contact)
@@ -194,35 +194,33 @@ class BatchedSolver:
     def _evaluate(self) -> None:
         """Evaluate the residuals of iterates and trials."""
         a, self._part = self._arrays, "residual"
-        f, mask, elements = a.fields, a.mask, self._element_dim
+        mask, elements, row, u = a.mask, self._element_dim, self._rows.row, a.trial.u
         self._launch(lane_orders.select_evaluated, self.batch, a.orders, a.found, mask)
-        where, residual = (self._rows.node_row, self._rows.pressure_row), (a.force, a.volume, a.jacobian)
-        trial = (a.orders, a.numbers, a.found, mask, a.step, *where, f, a.force, a.viscous, a.volume)
+        trial = (a.orders, a.numbers, a.found, mask, a.step, row, a.fields, a.residual, a.viscous)
         self._launch(fields.compute_trial, self._value_dim, *trial)
-        self._launch(bulk_residual, elements, f.trial_u, f.trial_p, mask, self._bulk, *residual)
+        self._launch(bulk_residual, elements, *a.trial, mask, self._bulk, *a.forces, a.jacobian)
         if self._barrier is not None:
-            self._launch(barrier_residual, elements, f.trial_u, mask, self._barrier, a.force, a.jacobian)
-        law, found = (self._faces, a.indenters, a.contact, PENALTY), (a.force, a.gap, a.tangential, a.traction)
-        self._launch(contact_residual, self._face_dim, f.trial_u, mask, *law, *found)
-        self._launch_blocks(
-            reductions.residual_norms, reductions.BLOCK, mask, *residual, self._rows.node_row, f, a.seen
-        )
+            self._launch(barrier_residual, elements, u, mask, self._barrier, a.forces.u, a.jacobian)
+        law, found = (self._faces, a.indenters, a.contact, PENALTY), (a.forces.u, a.gap, a.tangential, a.traction)
+        self._launch(contact_residual, self._face_dim, u, mask, *law, *found)
+        norms = (mask, a.residual, a.nodes, a.jacobian, row, a.fields)
+        self._launch_blocks(reductions.residual_norms, reductions.BLOCK, *norms, a.seen)
         self._launch(reductions.penetrations, self._face_dim, mask, a.gap, a.seen)
-        self._launch(viscous_force, elements, mask, f.iterate_u, f.trial_u, a.viscosity, self._bulk, a.viscous)
-        moved = (a.force, a.viscous, a.volume, *where, gmres.flat(a.krylov.basis), a.orders, a.numbers)
+        self._launch(viscous_force, elements, mask, a.iterate.u, u, a.viscosity, self._bulk, a.viscous_forces.u)
+        moved = (a.residual, a.nodes, a.viscous, row, gmres.flat(a.krylov.basis), a.orders, a.numbers)
         self._launch_blocks(reductions.relaxation_errors, reductions.BLOCK, mask, *moved, a.seen)
 
     def _linearise(self) -> None:
         a, self._part = self._arrays, "tangent"
-        f, mask, elements = a.fields, a.mask, self._element_dim[::-1]
-        self._launch(store_bulk, elements, mask, f.iterate_u, f.iterate_p, self._bulk, a.viscosity, a.stored)
+        u, mask, elements = a.iterate.u, a.mask, self._element_dim[::-1]
+        self._launch(store_bulk, elements, mask, *a.iterate, self._bulk, a.viscosity, a.stored)
         if self._barrier is not None:
-            self._launch(find_inverting, elements, mask, f.iterate_u, self._barrier, a.inverting)
+            self._launch(find_inverting, elements, mask, u, self._barrier, a.inverting)
         law, matrices = (self._faces, a.indenters, a.contact, PENALTY), (a.symmetric, a.remainder)
-        self._launch(contact_stiffness, self._face_dim, f.iterate_u, mask, *law, np.inf, a.touching, *matrices)
+        self._launch(contact_stiffness, self._face_dim, u, mask, *law, np.inf, a.touching, *matrices)
         stored = (a.stored_contact, a.touched)
         self._launch(store_contact, self._face_dim, mask, a.touching, self._faces.weight, *matrices, *stored)
-        right = (self._rows.free, a.force, a.volume, a.krylov)
+        right = (self._rows.free, a.residual, a.krylov)
         self._launch(gmres.begin_vectors, a.krylov.step.shape, mask, a.numbers, *right)
         self._launch(gmres.begin_solve, self.batch, mask, a.numbers, a.krylov)
 
@@ -239,7 +237,7 @@ class BatchedSolver:
         found = (a.stored, k.corrected, k.image)
         self._launch(self._product, elements, k.running, self._rows.single, *found, block=BLOCK)
         if self._barrier is not None:
-            where = (a.inverting, a.fields.iterate_u, self._barrier, self._rows.single.row)
+            where = (a.inverting, a.iterate.u, self._barrier, self._rows.single.row)
             self._launch(barrier_product, elements, k.running, *where, k.corrected, k.image)
         contact = (a.touched, self._rows.face_row, self._rows.face_shape, a.stored_contact)
         self._launch(self._contact_product, self._face_dim, k.running, *contact, k.corrected, k.image)
