@@ -41,10 +41,11 @@ def test_lanes_are_selected_by_their_orders() -> None:
 def test_linear_solves_are_as_exact_as_newton_needs() -> None:
     """The first; after a fall to a twentieth 0.9 / 400; near the tolerance 0.3 times what is left; the most."""
     posed = scene()
-    steps = LoadSteps(Press.of(posed, brick()).path, SIZE, False, posed.numerics, STANDARD)
+    press = Press.of(posed, brick())
+    steps = LoadSteps(press.path, SIZE, False, posed.numerics, STANDARD)
 
     def goals(forcing: float, *solves: tuple[float, int]) -> list[float]:
-        lane = Lane(0, steps, np.zeros(len(Number)), forcing)
+        lane = Lane(0, press, steps, np.zeros(len(Number)), forcing)
         return [lane._goal(Solve(relative, 1e-4, iteration), 1 / 20) for relative, iteration in solves]
 
     given = ((1.0, 0), (1.0, 1), (5e-3, 1), (2e-4, 1))

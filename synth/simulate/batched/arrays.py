@@ -38,8 +38,10 @@ class BatchArrays:
         values = (batch, 3 * self.nodes + (space.pressures if pad.mixed else 0))
         self.points = (batch, len(space.faces), len(space.element.face_weights))
         self.orders, self.numbers = zeros(batch, wp.int32), zeros((batch, len(Number)), wp.float64)
-        self.seen = zeros((batch, len(Seen)), wp.float64)
-        self.viscosity, self.shares = zeros(batch, wp.float64), zeros(batch, wp.float64)
+        self.seen = zeros((batch, Seen.FORCE + SCALARS), wp.float64)
+        self.sums = self.seen[:, Seen.FORCE :]
+        self.viscosity, self.stiffness = (self.numbers[:, n] for n in (Number.VISCOSITY, Number.STIFFNESS))
+        self.asked_share, self.share = self.numbers[:, Number.SHARE], zeros(batch, wp.float64)
         self.fields: Fields = zeros_of(Fields, lambda _: values, device)
         self.residual, self.viscous = zeros(values, wp.float64), zeros(values, wp.float64)
         self.state, self.iterate, self.trial, self.forces, self.viscous_forces = (
@@ -50,6 +52,7 @@ class BatchArrays:
         self.saved: ContactMemory = zeros_of(ContactMemory, lambda _: self.points, device)
         self.jacobian = zeros((batch, elements), wp.float64)
         self.gap, self.tangential = zeros(self.points, wp.float64), zeros(self.points, wp.vec3d)
+        self.gaps = self.gap.reshape((batch, -1))
         self.memory = ContactMemory()
         self.memory.gap, self.memory.tangential = self.gap, self.tangential
         for name in ("normal", "tangent", "anchor", "anchored"):
@@ -60,8 +63,7 @@ class BatchArrays:
             Indenters, lambda name: (batch, *grid) if name == "coefficients" else (batch,), device
         )
         self.records = zeros((batch, records, SCALARS + 3 * self.nodes + 3 * len(space.surface_nodes)), wp.float64)
-        self.sums = zeros((batch, 8), wp.float64)
-        self.mask, self.found = zeros(batch, wp.int32), zeros(batch, wp.int32)
+        self.mask = zeros(batch, wp.int32)
         stored = (elements, len(space.element.weights), STORED_YEOH if pad.yeoh else STORED, batch)
         self.stored = zeros(stored, wp.float32)
         self.inverting = zeros((elements, batch), wp.int32)

@@ -41,10 +41,8 @@ def clear_fields(mask: wp.array(dtype=wp.int32), fields: Fields):
 
 @wp.kernel
 def compute_trial(
-    orders: wp.array(dtype=wp.int32),
-    numbers: wp.array2d(dtype=wp.float64),
-    found: wp.array(dtype=wp.int32),
     mask: wp.array(dtype=wp.int32),
+    share: wp.array(dtype=wp.float64),
     step: wp.array2d(dtype=wp.float32),
     row: wp.array(dtype=wp.int32),
     fields: Fields,
@@ -53,20 +51,14 @@ def compute_trial(
 ):
     """One thread per (lane, value): what is evaluated, and zeros for its residual and viscous force.
 
-    That is the iterate; a share of the step further where it is tried, all of it where it was found in this cycle.
-    step: (B, rows); row: where a value is in it, -1 where it is held.
+    That is the iterate and a share of the step (B, rows). row: where a value is in it, -1 where it is held.
     """
     s, i = wp.tid()
     if mask[s] == 0:
         return
-    scale = wp.float64(0.0)
-    if (orders[s] & Order.TRY) != 0:
-        scale = numbers[s, Number.SHARE]
-    if found[s] == 1:
-        scale = wp.float64(1.0)
     x = fields.iterate[s, i]
-    if row[i] >= 0 and scale != wp.float64(0.0):
-        x += scale * wp.float64(step[s, row[i]])
+    if row[i] >= 0 and share[s] != wp.float64(0.0):
+        x += share[s] * wp.float64(step[s, row[i]])
     fields.trial[s, i] = x
     residual[s, i] = wp.float64(0.0)
     viscous[s, i] = wp.float64(0.0)

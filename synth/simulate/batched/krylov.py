@@ -247,13 +247,24 @@ def solution(rows: int) -> wp.Kernel:
 
 
 @wp.kernel
-def release(krylov: Krylov, orders: wp.array(dtype=wp.int32), found: wp.array(dtype=wp.int32)):
-    """One thread per lane: a solution leaves the lane waiting; its whole step is tried unless it is a predictor's."""
+def release(
+    krylov: Krylov,
+    orders: wp.array(dtype=wp.int32),
+    numbers: wp.array2d(dtype=wp.float64),
+    share: wp.array(dtype=wp.float64),
+    mask: wp.array(dtype=wp.int32),
+):
+    """One thread per lane: whether it is evaluated, and at which share of the step from the iterate.
+
+    A solution leaves the lane waiting, and its whole step is tried.
+    """
     s = wp.tid()
-    found[s] = 0
+    mask[s] = wp.where((orders[s] & (Order.EVALUATE | Order.TRY)) != 0, 1, 0)
+    share[s] = wp.where((orders[s] & Order.TRY) != 0, numbers[s, Number.SHARE], wp.float64(0.0))
     if krylov.running[s] == DONE:
         krylov.running[s] = WAITING
-        found[s] = wp.where((orders[s] & Order.STICKING) != 0, 0, 1)
+        mask[s] = 1
+        share[s] = wp.float64(1.0)
 
 
 HALF, KEPT = wp.constant(wp.uint32(0x1000)), wp.constant(wp.uint32(0xFFFFE000))

@@ -3,7 +3,10 @@
 from collections.abc import Generator
 from typing import Any
 
+import numpy as np
+
 from synth.arrays import FloatArray
+from synth.press.press import Press
 from synth.simulate.batched.lane_orders import PATH_DERIVATIVE_STEP, Number, Order, Seen
 from synth.simulate.linear import GMRES_TOLERANCE
 from synth.simulate.policy import requests as ask
@@ -16,21 +19,21 @@ Row = list[float]
 
 
 def _evaluation(seen: Row) -> ask.Evaluation:
-    return ask.Evaluation(*seen[: Seen.FORCE])
+    return ask.Evaluation(*seen[: Seen.DONE])
 
 
 class Lane:
     """A press in a lane.
 
     Attributes:
-        press: its number.
+        number, press: the press and its number.
         records: what it has recorded; the fields are on the device.
         ended: whether the present orders are the last; reason: why the press ended early, or nothing.
     """
 
-    def __init__(self, press: int, steps: LoadSteps, numbers: FloatArray, forcing: float) -> None:
+    def __init__(self, number: int, press: Press, steps: LoadSteps, numbers: FloatArray, forcing: float) -> None:
         """numbers: (k,) the lane's, by the columns of `Number`; written to in place."""
-        self.press, self.records = press, list[ask.Record]()
+        self.number, self.press, self.records = number, press, list[ask.Record]()
         self.ended, self.reason = False, ""
         self._steps, self._numbers, self._forcing = steps, numbers, forcing
         self._orders = self._translated()
@@ -41,9 +44,11 @@ class Lane:
     def _translated(self) -> Generator[int, Row, None]:
         policy, numbers = self._steps.run(), self._numbers
         answer: Any = None
-        order, at, target, stiffening, size = 0, 0.0, 0.0, 1.0, 1.0
-        numbers[Number.STIFFENING] = 1.0
-        iterate = trial = _evaluation([0.0] * len(Seen))
+        order, at, target, size = 0, 0.0, 0.0, 1.0
+        own = before_pass = numbers[Number.STIFFNESS] = (
+            self.press.scene.numerics.penalty * self.press.path.body.sharpness
+        )
+        iterate = trial = _evaluation([0.0] * Seen.DONE)
         is_stale = False  # whether the last evaluation was of a trial that was not taken
         while True:
             try:
@@ -61,15 +66,16 @@ class Lane:
                 elif request is ask.Do.ACCEPT:
                     at = target
                 elif request is ask.Do.KEEP_PASS:
-                    stiffening = numbers[Number.STIFFENING]
+                    before_pass = numbers[Number.STIFFNESS]
                 elif request is ask.Do.RESTORE_STEP:
-                    numbers[Number.STIFFENING] = 1.0
+                    numbers[Number.STIFFNESS] = own
                 elif request is ask.Do.FORCE:
-                    answer, order = (yield order)[Seen.FORCE], 0
+                    answer = float(np.dot((yield order)[Seen.FORCE : Seen.FORCE + 3], self.press.path.direction))
+                    order = 0
                 elif request is ask.Do.REPEAT:
                     changes = True
                 elif request is ask.Do.RESTORE_PASS:
-                    numbers[Number.STIFFENING], changes = stiffening, True
+                    numbers[Number.STIFFNESS], changes = before_pass, True
             elif kind is ask.Try:
                 if request.share < 1:
                     numbers[Number.SHARE] = request.share
@@ -102,7 +108,7 @@ class Lane:
                 numbers[Number.AT] = target
                 order |= start
             elif kind is ask.Augment:
-                numbers[Number.SHARE], numbers[Number.STIFFENING] = request.share, request.stiffening
+                numbers[Number.SHARE], numbers[Number.STIFFNESS] = request.share, request.stiffening * own
                 order, changes = order | Order.AUGMENT, True
             else:
                 numbers[Number.RECORD] = len(self.records)

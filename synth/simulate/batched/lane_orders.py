@@ -41,13 +41,16 @@ class Order:
 class Number(IntEnum):
     """Columns of the numbers that go with orders."""
 
-    AT, RATIO, SHARE, VISCOSITY, STIFFENING, NORM, GOAL, RECORD = range(8)
+    AT, RATIO, SHARE, VISCOSITY, STIFFNESS, NORM, GOAL, RECORD = range(8)
 
 
 class Seen(IntEnum):
-    """Columns of what a lane answers with: the parts of an Evaluation, and of a linear solve."""
+    """Columns of what a lane answers with: an Evaluation, a linear solve, and from FORCE on sums over what touches.
 
-    FREE, FORCES, REACTION, JACOBIAN, DEEPEST, MOVED, ERROR, FORCE, DONE, FINITE = range(10)
+    Those are force (3), moment (3), touching and slipping area.
+    """
+
+    FREE, FORCES, REACTION, JACOBIAN, DEEPEST, MOVED, ERROR, DONE, FINITE, FORCE = range(10)
 
 
 @wp.struct
@@ -59,7 +62,7 @@ class Presses:
             the lane's first press.
         origin, axes: of `LoadPath.frame`; zeros and the identity for flat pads and domes.
         position, rotation: of the body, as `LoadPath.pose` uses them; reach: the body's less the face's z, mm.
-        friction: as `synth.simulate.contact_friction.Indenters`; sharpness: times the contact stiffness, E per mm.
+        friction: as `synth.simulate.contact_friction.Indenters`.
     """
 
     corners: wp.array2d(dtype=wp.vec4d)
@@ -71,7 +74,6 @@ class Presses:
     reach: wp.array(dtype=wp.float64)
     rotation: wp.array(dtype=wp.mat33d)
     friction: wp.array(dtype=wp.float64)
-    sharpness: wp.array(dtype=wp.float64)
 
 
 @wp.kernel
@@ -79,28 +81,6 @@ def select(orders: wp.array(dtype=wp.int32), wanted: int, mask: wp.array(dtype=w
     """1 for lanes with any of the wanted orders."""
     s = wp.tid()
     mask[s] = wp.where((orders[s] & wanted) != 0, 1, 0)
-
-
-@wp.kernel
-def select_evaluated(orders: wp.array(dtype=wp.int32), found: wp.array(dtype=wp.int32), mask: wp.array(dtype=wp.int32)):
-    """1 for lanes that are to be evaluated or tried, or whose direction was found in this cycle."""
-    s = wp.tid()
-    mask[s] = wp.where((orders[s] & (Order.EVALUATE | Order.TRY)) != 0 or found[s] == 1, 1, 0)
-
-
-@wp.kernel
-def augmented_shares(
-    orders: wp.array(dtype=wp.int32), numbers: wp.array2d(dtype=wp.float64), shares: wp.array(dtype=wp.float64)
-):
-    """(B,) share of the update of multipliers, 0 where there is none."""
-    s = wp.tid()
-    shares[s] = wp.where((orders[s] & Order.AUGMENT) != 0, numbers[s, Number.SHARE], wp.float64(0.0))
-
-
-@wp.kernel
-def viscosities(numbers: wp.array2d(dtype=wp.float64), viscosity: wp.array(dtype=wp.float64)):
-    s = wp.tid()
-    viscosity[s] = numbers[s, Number.VISCOSITY]
 
 
 STICK_FRICTION = wp.constant(wp.float64(requests.STICK_FRICTION))
@@ -121,13 +101,6 @@ def _corner(presses: Presses, j: int, s: wp.float64) -> wp.vec4d:
     a = presses.corners[j, k]
     b = presses.corners[j, k + 1]
     return (s - presses.ends[j, k]) / (presses.ends[j, k + 1] - presses.ends[j, k]) * (b - a) + a
-
-
-@wp.kernel
-def set_stiffness(numbers: wp.array2d(dtype=wp.float64), presses: Presses, indenters: Indenters):
-    """The contact stiffness, so many times the body's own."""
-    s = wp.tid()
-    indenters.sharpness[s] = numbers[s, Number.STIFFENING] * presses.sharpness[s]
 
 
 @wp.kernel

@@ -26,7 +26,7 @@ class PressTable:
         self.kind, self.shape = np.zeros(batch, dtype=np.int32), np.zeros((batch, SHAPE_LENGTH))
         widths: dict[str, tuple[int, ...]] = {
             "corners": (1, 4), "ends": (1,), "origin": (3,), "axes": (3, 3), "position": (2,), "reach": (),
-            "rotation": (3, 3), "friction": (), "sharpness": (),
+            "rotation": (3, 3), "friction": (),
         }  # fmt: skip
         self._columns: dict[str, np.ndarray] = {name: np.zeros((batch, *width)) for name, width in widths.items()}
         self._columns["legs"] = np.zeros(batch, dtype=np.int32)
@@ -49,7 +49,6 @@ class PressTable:
             "reach": body.reach_mm - path.face_mm,
             "rotation": body.rotation,
             "friction": press.scene.contact.friction,
-            "sharpness": press.scene.numerics.penalty * body.sharpness,
         }
         for name, value in row.items():
             columns[name][lane] = value

@@ -3,7 +3,7 @@
 import warp as wp
 
 from synth.simulate.batched.fields import Fields, node_value
-from synth.simulate.batched.lane_orders import Number, Order, Seen
+from synth.simulate.batched.lane_orders import Number, Seen
 from synth.simulate.contact_friction import Faces, Indenters, position
 
 BLOCK = 256
@@ -29,13 +29,14 @@ def residual_norms(
     residual: wp.array2d(dtype=wp.float64),
     nodes: int,
     jacobian: wp.array2d(dtype=wp.float64),
+    gap: wp.array2d(dtype=wp.float64),
     row: wp.array(dtype=wp.int32),
     fields: Fields,
     seen: wp.array2d(dtype=wp.float64),
 ):
-    """One block per lane: norms of the free residual, all forces and those on held nodes, smallest det F, moved.
+    """One block per lane: what an Evaluation holds but for the error, see `synth.simulate.policy.requests`.
 
-    row: of each value in Krylov vectors, -1 where it is held.
+    gap: (B, points); row: of each value in Krylov vectors, -1 where it is held.
     """
     s, thread = wp.tid()
     if mask[s] == 0:
@@ -45,6 +46,7 @@ def residual_norms(
     held = wp.float64(0.0)
     smallest = wp.float64(1.0e30)
     farthest = wp.float64(0.0)
+    deepest = wp.float64(0.0)
     for i in range(thread, nodes, wp.block_dim()):
         moved = node_value(fields.trial, s, i) - node_value(fields.before_pass, s, i)
         farthest = wp.max(farthest, wp.length_sq(moved))
@@ -58,18 +60,21 @@ def residual_norms(
         free += residual[s, i] * residual[s, i]
     for i in range(thread, jacobian.shape[1], wp.block_dim()):
         smallest = wp.min(smallest, jacobian[s, i])
+    for i in range(thread, gap.shape[1], wp.block_dim()):
+        deepest = wp.max(deepest, -gap[s, i])
     free = wp.tile_extract(wp.tile_sum(wp.tile(free)), 0)
     whole = wp.tile_extract(wp.tile_sum(wp.tile(whole)), 0)
     smallest = wp.tile_extract(wp.tile_min(wp.tile(smallest)), 0)
     farthest = wp.tile_extract(wp.tile_max(wp.tile(farthest)), 0)
     held = wp.tile_extract(wp.tile_sum(wp.tile(held)), 0)
+    deepest = wp.tile_extract(wp.tile_max(wp.tile(deepest)), 0)
     if thread == 0:
         seen[s, Seen.FREE] = wp.sqrt(free)
         seen[s, Seen.FORCES] = wp.sqrt(whole)
         seen[s, Seen.REACTION] = wp.sqrt(held)
         seen[s, Seen.JACOBIAN] = smallest
         seen[s, Seen.MOVED] = wp.sqrt(farthest)
-        seen[s, Seen.DEEPEST] = wp.float64(0.0)
+        seen[s, Seen.DEEPEST] = deepest
 
 
 @wp.kernel
@@ -80,7 +85,7 @@ def relaxation_errors(
     viscous: wp.array2d(dtype=wp.float64),
     row: wp.array(dtype=wp.int32),
     right: wp.array2d(dtype=wp.float32),
-    orders: wp.array(dtype=wp.int32),
+    share: wp.array(dtype=wp.float64),
     numbers: wp.array2d(dtype=wp.float64),
     seen: wp.array2d(dtype=wp.float64),
 ):
@@ -91,10 +96,7 @@ def relaxation_errors(
     s, thread = wp.tid()
     if mask[s] == 0:
         return
-    part = wp.float64(1.0)
-    if (orders[s] & Order.TRY) != 0:
-        part = numbers[s, Number.SHARE]
-    left = (wp.float64(1.0) - part) * numbers[s, Number.NORM]
+    left = (wp.float64(1.0) - share[s]) * numbers[s, Number.NORM]
     total = wp.float64(0.0)
     for i in range(thread, nodes, wp.block_dim()):
         first = row[3 * i]
@@ -107,27 +109,6 @@ def relaxation_errors(
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
     if thread == 0:
         seen[s, Seen.ERROR] = wp.sqrt(total) / numbers[s, Number.NORM]
-
-
-@wp.kernel
-def clear_sums(mask: wp.array(dtype=wp.int32), values: wp.array2d(dtype=wp.float64)):
-    """One thread per (lane, number): zeros for the sums."""
-    s, i = wp.tid()
-    if mask[s] == 1:
-        values[s, i] = wp.float64(0.0)
-
-
-@wp.kernel
-def penetrations(mask: wp.array(dtype=wp.int32), gap: wp.array3d(dtype=wp.float64), seen: wp.array2d(dtype=wp.float64)):
-    """One thread per (lane, face): the largest penetration."""
-    s, f = wp.tid()
-    if mask[s] == 0:
-        return
-    deepest = wp.float64(0.0)
-    for q in range(gap.shape[2]):
-        deepest = wp.max(deepest, -gap[s, f, q])
-    if deepest > wp.float64(0.0):
-        wp.atomic_max(seen, s, Seen.DEEPEST, deepest)
 
 
 @wp.kernel
@@ -169,20 +150,6 @@ def contact_forces(
         wp.atomic_add(sums, s, 3 + i, moment[i])
     wp.atomic_add(sums, s, 6, touching)
     wp.atomic_add(sums, s, 7, slipping)
-
-
-@wp.kernel
-def press_forces(
-    mask: wp.array(dtype=wp.int32),
-    axes: wp.array(dtype=wp.mat33d),
-    sums: wp.array2d(dtype=wp.float64),
-    seen: wp.array2d(dtype=wp.float64),
-):
-    """The indenter's force along the press."""
-    s = wp.tid()
-    if mask[s] == 1:
-        a = axes[s]
-        seen[s, Seen.FORCE] = sums[s, 0] * a[0, 2] + sums[s, 1] * a[1, 2] + sums[s, 2] * a[2, 2]
 
 
 @wp.kernel

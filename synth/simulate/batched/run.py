@@ -76,7 +76,6 @@ class Run:
         self.solver = BatchedSolver(pad, batch, records, (grid[0], grid[1], grid[2]), inner)
         self._orders = np.zeros(batch, dtype=np.int32)
         self._numbers = np.zeros((batch, len(Number)))
-        self._presses: list[Press] = [press for _, (press, _) in first]
         self.lanes: list[Lane | None] = [None] * batch
         self.cycles = 0
         self._untouched: list[tuple[int, Trajectory]] = []
@@ -97,8 +96,8 @@ class Run:
             for s, lane, fields in over:
                 self.lanes[s] = None
                 seconds = float(spent - begun[s]) / self.solver.batch
-                result = trajectory(self._presses[s], lane.records, fields, lane.reason, seconds, self._pad.space)
-                yield lane.press, result
+                result = trajectory(lane.press, lane.records, fields, lane.reason, seconds, self._pad.space)
+                yield lane.number, result
 
     def advance(self) -> list[tuple[int, Lane]]:
         """One cycle, and what the lanes are told to do in the next; the lanes that have ended, with their numbers."""
@@ -121,8 +120,8 @@ class Run:
             if asked is None:
                 break
             number, (press, frames) = asked
-            lane = Lane(number, self._steps(press, frames), self._numbers[s], self._options.forcing)
-            begun[s], self.lanes[s], self._orders[s], self._presses[s] = press, lane, lane.first, press
+            lane = Lane(number, press, self._steps(press, frames), self._numbers[s], self._options.forcing)
+            begun[s], self.lanes[s], self._orders[s] = press, lane, lane.first
         if begun:
             self.solver.fill(begun)
         return list(begun)

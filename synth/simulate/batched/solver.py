@@ -102,7 +102,6 @@ class BatchedSolver:
         self._wanted = int(np.bitwise_or.reduce(orders))
         self._end_solves()
         self._begin_steps()
-        self._launch(lane_orders.viscosities, self.batch, a.numbers, a.viscosity)
         self._launch(lane_orders.place_indenters, self.batch, a.orders, a.numbers, self._presses, a.indenters)
         self._solve_and_evaluate()
 
@@ -133,7 +132,7 @@ class BatchedSolver:
             self._iterate()
         self._part = "krylov"
         self._launch_blocks(self._solution, self._block, a.krylov, a.seen)
-        self._launch(gmres.release, self.batch, a.krylov, a.orders, a.found)
+        self._launch(gmres.release, self.batch, a.krylov, a.orders, a.numbers, a.share, a.mask)
         self._evaluate()
 
     def _told(self, *orders: int) -> bool:
@@ -159,10 +158,9 @@ class BatchedSolver:
         if self._told(Order.KEEP_PASS):
             self._launch(fields.copy_multipliers, a.points, a.mask, *contact, *before)
         if self._told(Order.FORCE, Order.RECORD):
-            self._launch(reductions.clear_sums, a.sums.shape, a.mask, a.sums)
+            a.sums.zero_()
             found = (a.iterate.u, self._faces, a.indenters, a.traction, a.tangential)
             self._launch(reductions.contact_forces, self._face_dim, a.mask, *found, a.sums)
-            self._launch(reductions.press_forces, self.batch, a.mask, self._presses.axes, a.sums, a.seen)
         if self._told(Order.RECORD):
             written, size = (a.fields.iterate, a.nodes, a.sums, a.records), (self.batch, a.records.shape[2])
             self._launch(reductions.write_record, size, a.mask, a.numbers, *written)
@@ -174,7 +172,7 @@ class BatchedSolver:
         a = self._arrays
         if self._told(Order.RESTORE_STEP):
             self._launch(fields.copy_memory, a.points, a.mask, a.saved, a.memory)
-        self._launch(lane_orders.set_stiffness, self.batch, a.numbers, self._presses, a.indenters)
+        wp.copy(a.indenters.sharpness, a.stiffness)
         if self._told(Order.RESTORE_STEP, Order.ACCEPT, Order.BEGIN):
             self._launch(fields.to_start, self._value_dim, a.mask, a.orders, a.numbers, a.fields)
         if self._told(Order.ACCEPT):
@@ -183,8 +181,8 @@ class BatchedSolver:
             where = (PATH_DERIVATIVE_STEP, a.step, self._rows.row, a.fields)
             self._launch(fields.apply_predictor, self._value_dim, a.mask, *where)
         if self._told(Order.AUGMENT):
-            self._launch(lane_orders.augmented_shares, self.batch, a.orders, a.numbers, a.shares)
-            self._launch(augment, a.points, a.shares, a.indenters, a.gap, a.tangential, PENALTY, a.contact)
+            found = (a.indenters, a.gap, a.tangential, PENALTY, a.contact)
+            self._launch(augment, a.points, a.mask, a.asked_share, *found)
 
     def _update_contact_history(self, u: wp.array, new_only: int) -> None:
         a = self._arrays
@@ -195,19 +193,17 @@ class BatchedSolver:
         """Evaluate the residuals of iterates and trials."""
         a, self._part = self._arrays, "residual"
         mask, elements, row, u = a.mask, self._element_dim, self._rows.row, a.trial.u
-        self._launch(lane_orders.select_evaluated, self.batch, a.orders, a.found, mask)
-        trial = (a.orders, a.numbers, a.found, mask, a.step, row, a.fields, a.residual, a.viscous)
-        self._launch(fields.compute_trial, self._value_dim, *trial)
+        trial = (a.share, a.step, row, a.fields, a.residual, a.viscous)
+        self._launch(fields.compute_trial, self._value_dim, mask, *trial)
         self._launch(bulk_residual, elements, *a.trial, mask, self._bulk, *a.forces, a.jacobian)
         if self._barrier is not None:
             self._launch(barrier_residual, elements, u, mask, self._barrier, a.forces.u, a.jacobian)
         law, found = (self._faces, a.indenters, a.contact, PENALTY), (a.forces.u, a.gap, a.tangential, a.traction)
         self._launch(contact_residual, self._face_dim, u, mask, *law, *found)
-        norms = (mask, a.residual, a.nodes, a.jacobian, row, a.fields)
+        norms = (mask, a.residual, a.nodes, a.jacobian, a.gaps, row, a.fields)
         self._launch_blocks(reductions.residual_norms, reductions.BLOCK, *norms, a.seen)
-        self._launch(reductions.penetrations, self._face_dim, mask, a.gap, a.seen)
         self._launch(viscous_force, elements, mask, a.iterate.u, u, a.viscosity, self._bulk, a.viscous_forces.u)
-        moved = (a.residual, a.nodes, a.viscous, row, gmres.flat(a.krylov.basis), a.orders, a.numbers)
+        moved = (a.residual, a.nodes, a.viscous, row, gmres.flat(a.krylov.basis), a.share, a.numbers)
         self._launch_blocks(reductions.relaxation_errors, reductions.BLOCK, mask, *moved, a.seen)
 
     def _linearise(self) -> None:
