@@ -197,14 +197,14 @@ def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, sti
         assert inverting.numpy().any()
         inputs = [mask, inverting, displacement, barrier, numbering.single.row, vector]
         launch(barrier_product, elements, inputs, [image])
-    touching, touched = (zeros(points[:2], wp.int32) for _ in range(2))
+    touching = zeros(points[:2], wp.int32)
     symmetric, remainder = (zeros(points, wp.mat33d) for _ in range(2))
     contact = zeros(points, wp.mat33f)
     inputs = [displacement, mask, faces, bodies, body.contact, body.penalty, np.inf]
     launch(contact_stiffness, points[:2], inputs, [touching, symmetric, remainder])
     assert (touching.numpy() == 2).any()
-    launch(store_contact, points[:2], [mask, touching, faces.weight, symmetric, remainder], [contact, touched])
-    inputs = [mask, touched, numbering.face_row, numbering.face_shape, contact, vector]
+    launch(store_contact, points[:2], [mask, touching, faces.weight, symmetric, remainder], [contact])
+    inputs = [mask, touching, numbering.face_row, numbering.face_shape, contact, vector]
     launch(contact_product(space.faces.shape[1]), points[:2], inputs, [image])
     expected = tangent @ x[: len(body.free), 0].astype(np.float64)
     # Sums of some 100 products rounded to 6e-8, of terms some times larger than the sum.

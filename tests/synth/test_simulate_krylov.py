@@ -20,16 +20,20 @@ from synth.simulate.policy.load_steps import LoadSteps
 from synth.simulate.policy.requests import Solve
 
 
-def _systems(batch: int, device: str = "cpu") -> tuple[Krylov, list[Any]]:
-    """Lanes at the start of a linear solve, its right side of norm 1, and their mask and numbers."""
-    krylov, sizes = Krylov(), kernels.shapes(padded(150), batch)
+def _systems(batch: int, device: str = "cpu", residual: np.ndarray | None = None) -> Krylov:
+    """Lanes at the start of a linear solve, for residuals (batch, 150) that are told to be of norm 1."""
+    rows = padded(150)
+    krylov, sizes = Krylov(), kernels.shapes(rows, batch)
     for name, variable in Krylov.vars.items():
         setattr(krylov, name, wp.zeros(sizes[name], dtype=variable.type.dtype, device=device))
+    residual = np.zeros((batch, 150)) if residual is None else residual
     numbers = np.zeros((batch, len(Number)))
     numbers[:, [Number.NORM, Number.GOAL]] = 1.0, 1e-3
-    told = [wp.ones(batch, dtype=wp.int32, device=device), wp.array(numbers, dtype=wp.float64, device=device)]
-    wp.launch(kernels.begin_solve, batch, inputs=[*told, krylov], device=device)
-    return krylov, told
+    free = np.append(np.arange(150), np.full(rows - 150, -1))
+    given = (np.ones(batch), wp.int32), (numbers, wp.float64), (free, wp.int32), (residual, wp.float64)
+    inputs = [wp.array(values, dtype=dtype, device=device) for values, dtype in given]
+    wp.launch(kernels.begin_solves, (batch, rows // 4), inputs=[*inputs, krylov], device=device)
+    return krylov
 
 
 def test_lanes_are_selected_by_their_orders() -> None:
@@ -68,7 +72,7 @@ def test_every_lane_solves_its_own_system(device: str, batch: int) -> None:
     rights /= np.linalg.norm(rights, axis=1, keepdims=True)
 
     def solved(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        krylov, _ = _systems(len(which), device)
+        krylov = _systems(len(which), device)
         krylov.goal.assign(goals[which])
         first = np.zeros(flat(krylov.current).shape, dtype=np.float32)
         first[:, :size] = rights[which]
@@ -102,7 +106,7 @@ def test_every_lane_solves_its_own_system(device: str, batch: int) -> None:
 
 
 def test_a_solve_that_misses_its_goal_ends_at_the_limit() -> None:
-    krylov, _ = _systems(1)
+    krylov = _systems(1)
     krylov.goal.fill_(0.0)
     krylov.k.fill_(GMRES_LIMIT - 2)
     product = flat(krylov.product)
@@ -140,12 +144,8 @@ def test_a_preconditioner_takes_tf32_from_the_first_vector_on() -> None:
     np.testing.assert_allclose(found[:150, :150], np.linalg.inv(matrix + matrix.T), rtol=1 / 2000)
     assert np.count_nonzero(found) == np.count_nonzero(found[:150, :150])
     assert (_bits(found) == 0).all()
-    krylov, told = _systems(2)
+    krylov = _systems(2, residual=rng.standard_normal((2, 150)))
     rows = flat(krylov.current).shape[1]
-    free = np.append(np.arange(150), np.full(rows - 150, -1)).astype(np.int32)
-    residual = wp.array(rng.standard_normal((2, 150)), dtype=wp.float64, device="cpu")
-    inputs = [*told, wp.array(free, device="cpu"), residual, krylov]
-    wp.launch(kernels.begin_vectors, (2, rows // 4), inputs=inputs, device="cpu")
     first = flat(krylov.current).numpy().copy()
     flat(krylov.product).assign(rng.standard_normal((2, rows)).astype(np.float32))
     wp.launch_tiled(arnoldi(rows), dim=[2], inputs=[krylov], block_dim=block_size(rows), device="cpu")

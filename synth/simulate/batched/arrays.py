@@ -49,7 +49,7 @@ class BatchArrays:
             for each in (self.fields.state, self.fields.iterate, self.fields.trial, self.residual, self.viscous)
         )
         self.contact: ContactState = zeros_of(ContactState, lambda _: self.points, device)
-        self.saved: ContactMemory = zeros_of(ContactMemory, lambda _: self.points, device)
+        self.after_step, self.before_pass = (zeros_of(ContactMemory, lambda _: self.points, device) for _ in range(2))
         self.jacobian = zeros((batch, elements), wp.float64)
         self.gap, self.tangential = zeros(self.points, wp.float64), zeros(self.points, wp.vec3d)
         self.gaps = self.gap.reshape((batch, -1))
@@ -58,7 +58,6 @@ class BatchArrays:
         for name in ("normal", "tangent", "anchor", "anchored"):
             setattr(self.memory, name, getattr(self.contact, name))
         self.traction = zeros(self.points, wp.vec3d)
-        self.normal_before, self.tangent_before = zeros(self.points, wp.float64), zeros(self.points, wp.vec3d)
         self.indenters: Indenters = zeros_of(
             Indenters, lambda name: (batch, *grid) if name == "coefficients" else (batch,), device
         )
@@ -67,7 +66,7 @@ class BatchArrays:
         stored = (elements, len(space.element.weights), STORED_YEOH if pad.yeoh else STORED, batch)
         self.stored = zeros(stored, wp.float32)
         self.inverting = zeros((elements, batch), wp.int32)
-        self.touching, self.touched = zeros(self.points[:2], wp.int32), zeros(self.points[:2], wp.int32)
+        self.touching = zeros(self.points[:2], wp.int32)
         self.symmetric, self.remainder = zeros(self.points, wp.mat33d), zeros(self.points, wp.mat33d)
         self.stored_contact = zeros(self.points, wp.mat33f)
         sizes = shapes(pad.preconditioner.rows, batch)

@@ -3,7 +3,6 @@
 import warp as wp
 
 from synth.simulate.batched.lane_orders import Number, Order
-from synth.simulate.contact_friction import FAR, ContactState
 
 
 @wp.struct
@@ -28,15 +27,6 @@ class Fields:
 def node_value(values: wp.array2d(dtype=wp.float64), s: int, node: int) -> wp.vec3d:
     """A node's part of values (B, 3 n + k)."""
     return wp.vec3d(values[s, 3 * node], values[s, 3 * node + 1], values[s, 3 * node + 2])
-
-
-@wp.kernel
-def clear_fields(mask: wp.array(dtype=wp.int32), fields: Fields):
-    """One thread per (lane, value): the undeformed state in fresh lanes."""
-    s, i = wp.tid()
-    if mask[s] == 1:
-        fields.state[s, i] = wp.float64(0.0)
-        fields.previous[s, i] = wp.float64(0.0)
 
 
 @wp.kernel
@@ -127,18 +117,6 @@ def to_start(
     fields.iterate[s, i] = x
 
 
-@wp.kernel
-def clear_contact(mask: wp.array(dtype=wp.int32), contact: ContactState):
-    """One thread per (lane, face, point): nothing touched before in a fresh lane, not even what touches at once."""
-    s, f, q = wp.tid()
-    if mask[s] == 0:
-        return
-    contact.normal[s, f, q] = wp.float64(0.0)
-    contact.tangent[s, f, q] = wp.vec3d()
-    contact.anchored[s, f, q] = 0
-    contact.gap[s, f, q] = FAR
-
-
 @wp.struct
 class ContactMemory:
     """What corrections of a recorded state change of contact, (B, f, nq): see `synth.simulate.contact_friction`.
@@ -166,18 +144,3 @@ def copy_memory(mask: wp.array(dtype=wp.int32), source: ContactMemory, target: C
     target.anchored[s, f, q] = source.anchored[s, f, q]
     target.gap[s, f, q] = source.gap[s, f, q]
     target.tangential[s, f, q] = source.tangential[s, f, q]
-
-
-@wp.kernel
-def copy_multipliers(
-    mask: wp.array(dtype=wp.int32),
-    normal: wp.array3d(dtype=wp.float64),
-    tangent: wp.array3d(dtype=wp.vec3d),
-    to_normal: wp.array3d(dtype=wp.float64),
-    to_tangent: wp.array3d(dtype=wp.vec3d),
-):
-    """One thread per (lane, face, point): before a pass, or after one that failed."""
-    s, f, q = wp.tid()
-    if mask[s] == 1:
-        to_normal[s, f, q] = normal[s, f, q]
-        to_tangent[s, f, q] = tangent[s, f, q]

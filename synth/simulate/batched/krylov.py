@@ -104,14 +104,14 @@ def padded(unknowns: int) -> int:
 
 
 @wp.kernel
-def begin_vectors(
+def begin_solves(
     mask: wp.array(dtype=wp.int32),
     numbers: wp.array2d(dtype=wp.float64),
     free: wp.array(dtype=wp.int32),
     residual: wp.array2d(dtype=wp.float64),
     krylov: Krylov,
 ):
-    """One thread per (lane, four rows): the first basis vector, minus the residual over its norm.
+    """One thread per (lane, four rows): iterations begin, with minus the residual over its norm as first basis vector.
 
     free: (rows,) number of the value in a residual (B, 3 n + k), or -1 for rows that fill up.
     """
@@ -126,21 +126,12 @@ def begin_vectors(
             found[k] = wp.float32(-residual[s, unknown] / size)
     krylov.basis[s, 0, i] = found
     krylov.current[s, i] = rounded_four(found)
-
-
-@wp.kernel
-def begin_solve(mask: wp.array(dtype=wp.int32), numbers: wp.array2d(dtype=wp.float64), krylov: Krylov):
-    """One thread per lane: where a right side and a matrix are ready, iterations begin."""
-    s = wp.tid()
-    if mask[s] == 0:
-        return
-    krylov.goal[s] = wp.float32(numbers[s, Number.GOAL])
-    krylov.size[s] = numbers[s, Number.NORM]
-    krylov.k[s] = 0
-    krylov.residual[s, 0] = ONE
-    krylov.running[s] = RUNNING
-    if numbers[s, Number.NORM] == wp.float64(0.0):
-        krylov.running[s] = DONE
+    if i == 0:
+        krylov.goal[s] = wp.float32(numbers[s, Number.GOAL])
+        krylov.size[s] = size
+        krylov.k[s] = 0
+        krylov.residual[s, 0] = ONE
+        krylov.running[s] = wp.where(size == wp.float64(0.0), DONE, RUNNING)
 
 
 @cache

@@ -197,14 +197,10 @@ def store_contact(
     symmetric: wp.array3d(dtype=wp.mat33d),
     remainder: wp.array3d(dtype=wp.mat33d),
     stored: wp.array3d(dtype=wp.mat33f),
-    touched: wp.array2d(dtype=wp.int32),
 ):
     """One thread per (lane, face): w times the whole of -∂t/∂x at its points, where it touches."""
     s, f = wp.tid()
-    if mask[s] == 0:
-        return
-    touched[s, f] = touching[s, f]
-    if touching[s, f] == 0:
+    if mask[s] == 0 or touching[s, f] == 0:
         return
     for q in range(weight.shape[1]):
         stored[s, f, q] = wp.mat33f(weight[f, q] * (symmetric[s, f, q] + remainder[s, f, q]))
@@ -219,7 +215,7 @@ def contact_product(nodes: int) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def product(
         running: wp.array(dtype=wp.int32),
-        touched: wp.array2d(dtype=wp.int32),
+        touching: wp.array2d(dtype=wp.int32),
         row: wp.array2d(dtype=wp.int32),
         shape: wp.array2d(dtype=wp.float32),
         stored: wp.array3d(dtype=wp.mat33f),
@@ -227,7 +223,7 @@ def contact_product(nodes: int) -> wp.Kernel:
         y: wp.array2d(dtype=wp.float32),
     ):
         s, f = wp.tid()
-        if running[s] != RUNNING or touched[s, f] == 0:
+        if running[s] != RUNNING or touching[s, f] == 0:
             return
         v = nodal()
         r = nodal()

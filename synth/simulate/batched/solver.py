@@ -35,7 +35,7 @@ from synth.simulate.batched.product import (
     store_contact,
 )
 from synth.simulate.bulk import bulk_residual
-from synth.simulate.contact_friction import contact_residual, contact_stiffness
+from synth.simulate.contact_friction import FAR, contact_residual, contact_stiffness
 from synth.simulate.inversion_barrier import barrier_residual
 from synth.simulate.multipliers import augment, update_contact_history
 from synth.simulate.stiffness import viscous_force
@@ -146,17 +146,16 @@ class BatchedSolver:
     def _end_solves(self) -> None:
         """Where a Newton solve ended: the iterate, snapshots of it, multipliers, and what is recorded."""
         a, self._part = self._arrays, "stepping"
-        contact, before = (a.contact.normal, a.contact.tangent), (a.normal_before, a.tangent_before)
         if self._told(Order.TAKE, Order.RESTORE_PASS, Order.REPEAT, Order.KEEP_STEP, Order.KEEP_PASS):
             self._launch(fields.to_solution, self._value_dim, a.mask, a.orders, a.fields)
         if self._told(Order.RESTORE_PASS):
-            self._launch(fields.copy_multipliers, a.points, a.mask, *before, *contact)
+            self._launch(fields.copy_memory, a.points, a.mask, a.before_pass, a.memory)
         if self._told(Order.KEEP_STEP):
-            self._launch(fields.copy_memory, a.points, a.mask, a.memory, a.saved)
+            self._launch(fields.copy_memory, a.points, a.mask, a.memory, a.after_step)
         if self._told(Order.ANCHOR):
             self._update_contact_history(a.iterate.u, 1)
         if self._told(Order.KEEP_PASS):
-            self._launch(fields.copy_multipliers, a.points, a.mask, *contact, *before)
+            self._launch(fields.copy_memory, a.points, a.mask, a.memory, a.before_pass)
         if self._told(Order.FORCE, Order.RECORD):
             a.sums.zero_()
             found = (a.iterate.u, self._faces, a.indenters, a.traction, a.tangential)
@@ -171,7 +170,7 @@ class BatchedSolver:
         """Steps that are accepted, passes and steps that begin."""
         a = self._arrays
         if self._told(Order.RESTORE_STEP):
-            self._launch(fields.copy_memory, a.points, a.mask, a.saved, a.memory)
+            self._launch(fields.copy_memory, a.points, a.mask, a.after_step, a.memory)
         wp.copy(a.indenters.sharpness, a.stiffness)
         if self._told(Order.RESTORE_STEP, Order.ACCEPT, Order.BEGIN):
             self._launch(fields.to_start, self._value_dim, a.mask, a.orders, a.numbers, a.fields)
@@ -214,11 +213,10 @@ class BatchedSolver:
             self._launch(find_inverting, elements, mask, u, self._barrier, a.inverting)
         law, matrices = (self._faces, a.indenters, a.contact, PENALTY), (a.symmetric, a.remainder)
         self._launch(contact_stiffness, self._face_dim, u, mask, *law, np.inf, a.touching, *matrices)
-        stored = (a.stored_contact, a.touched)
-        self._launch(store_contact, self._face_dim, mask, a.touching, self._faces.weight, *matrices, *stored)
+        stored = (a.touching, self._faces.weight, *matrices, a.stored_contact)
+        self._launch(store_contact, self._face_dim, mask, *stored)
         right = (self._rows.free, a.residual, a.krylov)
-        self._launch(gmres.begin_vectors, a.krylov.step.shape, mask, a.numbers, *right)
-        self._launch(gmres.begin_solve, self.batch, mask, a.numbers, a.krylov)
+        self._launch(gmres.begin_solves, a.krylov.step.shape, mask, a.numbers, *right)
 
     def _iterate(self) -> None:
         a, k, elements, preconditioner = self._arrays, self.krylov, self._element_dim[::-1], self.pad.preconditioner
@@ -235,7 +233,7 @@ class BatchedSolver:
         if self._barrier is not None:
             where = (a.inverting, a.iterate.u, self._barrier, self._rows.single.row)
             self._launch(barrier_product, elements, k.running, *where, k.corrected, k.image)
-        contact = (a.touched, self._rows.face_row, self._rows.face_shape, a.stored_contact)
+        contact = (a.touching, self._rows.face_row, self._rows.face_shape, a.stored_contact)
         self._launch(self._contact_product, self._face_dim, k.running, *contact, k.corrected, k.image)
         preconditioner.dense.transpose(k.image, gmres.flat(k.product))
         self._tell("transpose")
@@ -244,18 +242,18 @@ class BatchedSolver:
 
     def fill(self, presses: Mapping[int, Press]) -> None:
         """Begin presses, by lane."""
-        a, indenters, fresh = self._arrays, self._arrays.indenters, np.zeros(self.batch, dtype=np.int32)
+        a, indenters = self._arrays, self._arrays.indenters
+        untouched = (a.fields.state, a.fields.previous, a.contact.normal, a.contact.tangent, a.contact.anchored)
         for s, press in presses.items():
             self._table.put(s, press)
-            fresh[s] = 1
+            for values in untouched:
+                values[s].zero_()
+            a.contact.gap[s].fill_(FAR)
             if indenters.coefficients.size > self.batch:
                 indenters.coefficients[s].assign(padded(press.path.body.coefficients, indenters.coefficients.shape[1:]))
         self._presses = self._table.on_device()
         indenters.kind.assign(self._table.kind)
         indenters.shape.assign(self._table.shape)
-        a.mask.assign(fresh)
-        self._launch(fields.clear_fields, self._value_dim, a.mask, a.fields)
-        self._launch(fields.clear_contact, a.points, a.mask, a.contact)
 
     def recorded(self, lane: int, count: int) -> FloatArray:
         """The first states that a lane has recorded, a copy: its next press writes into the same memory."""
