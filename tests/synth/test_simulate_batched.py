@@ -18,6 +18,7 @@ from synth.simulate import Trajectory, simulate
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.arrays import number_rows
 from synth.simulate.batched.krylov import padded
+from synth.simulate.batched.lane_orders import Number, Order
 from synth.simulate.batched.pad import prepare
 from synth.simulate.batched.product import (
     STORED_YEOH,
@@ -28,8 +29,8 @@ from synth.simulate.batched.product import (
     store_bulk,
     store_contact,
 )
-from synth.simulate.batched.run import OPTIONS, Asked
-from synth.simulate.contact_friction import contact_stiffness
+from synth.simulate.batched.run import OPTIONS, Asked, Run
+from synth.simulate.contact_friction import FAR, contact_stiffness
 from synth.simulate.material import uniform
 from synth.simulate.options import SolverOptions
 from synth.simulate.space import function_space
@@ -102,6 +103,23 @@ def test_company_order_and_lost_samples_change_no_bit() -> None:
     first, second = simulate_scenes([lost, good], thin)
     assert (first.status, "did not converge" in first.reason) == ("partial", True)
     assert same(second, simulate_scenes([good], thin)[0])
+
+
+def test_a_lane_goes_back_to_its_snapshots_and_begins_afresh() -> None:
+    press = Press.of(scene(friction=0.4), MESH)
+    solver = Run([(0, (press, None))], iter([]), prepare(press.scene, MESH, "cpu"), OPTIONS).solver
+    contact, iterate = solver._arrays.contact, solver._arrays.fields.iterate
+    changing = (iterate, contact.normal, contact.tangent, contact.anchor, contact.anchored)
+    for keep, restore in ((Order.KEEP_PASS, Order.RESTORE_PASS), (Order.KEEP_STEP, Order.RESTORE_STEP)):
+        for order, value in ((keep, 1), (restore, 2)):
+            for array in changing:
+                array.fill_(value)
+            solver.begin_cycle(np.array([order]), np.zeros((1, len(Number))))
+        assert all((array.numpy() == 1).all() for array in changing)
+    contact.gap.zero_()
+    solver.fill({0: press})
+    assert (contact.gap.numpy() == FAR).all()
+    assert not any(array.numpy().any() for array in (contact.normal, contact.tangent, contact.anchored))
 
 
 def test_a_press_that_records_more_waits_for_a_run_with_room_for_it() -> None:
