@@ -58,8 +58,7 @@ class Presses:
     """The load path and body of each lane's press, (B, ...).
 
     Attributes:
-        corners, ends, legs: `LoadPath.corners` (B, K, 4), `LoadPath.ends` (B, K) and their number, 0 before
-            the lane's first press.
+        corners, ends: `LoadPath.corners` (B, K, 4) and `LoadPath.ends` (B, K), infinite behind the last corner.
         origin, axes: of `LoadPath.frame`; zeros and the identity for flat pads and domes.
         position, rotation: of the body, as `LoadPath.pose` uses them; reach: the body's less the face's z, mm.
         friction: as `synth.simulate.contact_friction.Indenters`.
@@ -67,7 +66,6 @@ class Presses:
 
     corners: wp.array2d(dtype=wp.vec4d)
     ends: wp.array2d(dtype=wp.float64)
-    legs: wp.array(dtype=wp.int32)
     origin: wp.array(dtype=wp.vec3d)
     axes: wp.array(dtype=wp.mat33d)
     position: wp.array(dtype=wp.vec2d)
@@ -90,11 +88,6 @@ PATH_DERIVATIVE_STEP = requests.PATH_DERIVATIVE_STEP
 @wp.func
 def _corner(presses: Presses, j: int, s: wp.float64) -> wp.vec4d:
     """Depth, shear and twist at path length s, as `numpy.interp` finds them."""
-    last = presses.legs[j] - 1
-    if s <= presses.ends[j, 0]:
-        return presses.corners[j, 0]
-    if s >= presses.ends[j, last]:
-        return presses.corners[j, last]
     k = wp.int32(0)
     while presses.ends[j, k + 1] <= s:
         k += 1
@@ -112,8 +105,6 @@ def place_indenters(
 ):
     """Each lane's indenter where it is to be, and its friction."""
     i = wp.tid()
-    if presses.legs[i] == 0:
-        return
     pose = _corner(presses, i, numbers[i, Number.AT])
     place = presses.position[i]
     local = wp.vec3d(place[0] + pose[1], place[1] + pose[2], pose[0] - presses.reach[i])

@@ -25,24 +25,25 @@ class PressTable:
         self._device = device
         self.kind, self.shape = np.zeros(batch, dtype=np.int32), np.zeros((batch, SHAPE_LENGTH))
         widths: dict[str, tuple[int, ...]] = {
-            "corners": (1, 4), "ends": (1,), "origin": (3,), "axes": (3, 3), "position": (2,), "reach": (),
+            "corners": (2, 4), "ends": (2,), "origin": (3,), "axes": (3, 3), "position": (2,), "reach": (),
             "rotation": (3, 3), "friction": (),
         }  # fmt: skip
         self._columns: dict[str, np.ndarray] = {name: np.zeros((batch, *width)) for name, width in widths.items()}
-        self._columns["legs"] = np.zeros(batch, dtype=np.int32)
+        self._columns["ends"][:, 1] = np.inf
 
     def put(self, lane: int, press: Press) -> None:
         """A press begins in a lane."""
         columns, path = self._columns, press.path
-        body, legs = path.body, len(path.ends)
+        body, corners = path.body, len(path.ends)
         self.kind[lane], self.shape[lane] = body.kind, body.shape
-        for name, values in (("corners", path.corners), ("ends", path.ends)):
-            column = columns[name]
-            if column.shape[1] < len(values):
-                columns[name] = column = padded(column, (len(column), len(values), *column.shape[2:]))
-            column[lane, : len(values)] = values
+        for name, values, behind in (("corners", path.corners, 0.0), ("ends", path.ends, np.inf)):
+            more = corners + 1 - columns[name].shape[1]
+            if more > 0:
+                widths = [(0, 0), (0, more), (0, 0)][: columns[name].ndim]
+                columns[name] = np.pad(columns[name], widths, constant_values=behind)
+            columns[name][lane] = behind
+            columns[name][lane, :corners] = values
         row = {
-            "legs": legs,
             "origin": np.zeros(3) if path.frame is None else path.frame.origin,
             "axes": np.eye(3) if path.frame is None else path.frame.axes,
             "position": path.motion.position_mm,
