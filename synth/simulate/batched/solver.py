@@ -11,7 +11,7 @@ a Newton iterate change from run to run even for the same batch; what converges 
 another equilibrium (docs/reports/batched_fem.md, Rounding).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -67,29 +67,20 @@ class BatchedSolver:
         self._surface = struct_of(reductions.SurfaceTables, device, **surface)
         self._product = bulk_product(space.nodes.shape[1], pad.mixed, space.element.stabilisation > 0, pad.yeoh)
         self._contact_product = contact_product(space.faces.shape[1])
-        self._block = gmres.block_size(rows)
+        self._transpose, self._block = pad.preconditioner.dense.transpose, gmres.block_size(rows)
         self._arnoldi, self._solution = gmres.arnoldi(rows), gmres.solution(rows)
         self._arrays = BatchArrays(pad, batch, records, grid)
         self.krylov = self._arrays.krylov
         self._element_dim, self._face_dim = (batch, len(space.nodes)), self._arrays.points[:2]
         self._value_dim = self._arrays.residual.shape
-        self.watch: Callable[[str, str], None] | None = None
-        """Called after each launch with the part of the cycle and the kernel's name, for profiles."""
-        self._part = ""
         self._is_warm, self._graph = False, None
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], *arguments: Any, block: int = 256) -> None:
         wp.launch(kernel, dim, inputs=list(arguments), device=self.device, block_dim=block)
-        self._tell(kernel.key)
 
     def _launch_blocks(self, kernel: wp.Kernel, block: int, *arguments: Any) -> None:
         """One block of so many threads per lane."""
         wp.launch_tiled(kernel, dim=[self.batch], inputs=list(arguments), block_dim=block, device=self.device)
-        self._tell(kernel.key)
-
-    def _tell(self, kernel: str) -> None:
-        if self.watch is not None:
-            self.watch(self._part, kernel)
 
     def begin_cycle(self, orders: np.ndarray, numbers: FloatArray) -> None:
         """Do what all lanes are told; on CUDA queue it.
@@ -112,7 +103,7 @@ class BatchedSolver:
     def _solve_and_evaluate(self) -> None:
         """What every cycle does; on CUDA a graph that is captured the second time, when all kernels are loaded."""
         device = wp.get_device(self.device)
-        if not device.is_cuda or not self._is_warm or self.watch is not None:
+        if not device.is_cuda or not self._is_warm:
             self._launch_all()
             self._is_warm = True
             return
@@ -130,7 +121,6 @@ class BatchedSolver:
         self._linearise()
         for _ in range(self.inner):
             self._iterate()
-        self._part = "krylov"
         self._launch_blocks(self._solution, self._block, a.krylov, a.seen)
         self._launch(gmres.release, self.batch, a.krylov, a.orders, a.numbers, a.share, a.mask)
         self._evaluate()
@@ -145,7 +135,7 @@ class BatchedSolver:
 
     def _end_solves(self) -> None:
         """Where a Newton solve ended: the iterate, snapshots of it, multipliers, and what is recorded."""
-        a, self._part = self._arrays, "stepping"
+        a = self._arrays
         if self._told(Order.TAKE, Order.RESTORE_PASS, Order.REPEAT, Order.KEEP_STEP, Order.KEEP_PASS):
             self._launch(fields.to_solution, self._value_dim, a.mask, a.orders, a.fields)
         if self._told(Order.RESTORE_PASS):
@@ -190,7 +180,7 @@ class BatchedSolver:
 
     def _evaluate(self) -> None:
         """Evaluate the residuals of iterates and trials."""
-        a, self._part = self._arrays, "residual"
+        a = self._arrays
         mask, elements, row, u = a.mask, self._element_dim, self._rows.row, a.trial.u
         trial = (a.share, a.step, row, a.fields, a.residual, a.viscous)
         self._launch(fields.compute_trial, self._value_dim, mask, *trial)
@@ -206,7 +196,7 @@ class BatchedSolver:
         self._launch_blocks(reductions.relaxation_errors, reductions.BLOCK, mask, *moved, a.seen)
 
     def _linearise(self) -> None:
-        a, self._part = self._arrays, "tangent"
+        a = self._arrays
         u, mask, elements = a.iterate.u, a.mask, self._element_dim[::-1]
         self._launch(store_bulk, elements, mask, *a.iterate, self._bulk, a.viscosity, a.stored)
         if self._barrier is not None:
@@ -219,15 +209,15 @@ class BatchedSolver:
         self._launch(gmres.begin_solves, a.krylov.step.shape, mask, a.numbers, *right)
 
     def _iterate(self) -> None:
-        a, k, elements, preconditioner = self._arrays, self.krylov, self._element_dim[::-1], self.pad.preconditioner
-        self._part = "preconditioner"
-        preconditioner.apply(k)
-        self._tell("product with the inverse")
-        self._part = "product"
-        preconditioner.dense.transpose(gmres.flat(k.preconditioned), k.corrected)
-        self._tell("transpose")
+        self.pad.preconditioner.apply(self.krylov)
+        self._multiply()
+        self._launch_blocks(self._arnoldi, self._block, self.krylov)
+
+    def _multiply(self) -> None:
+        """The tangent times the preconditioned vectors."""
+        a, k, elements, transpose = self._arrays, self.krylov, self._element_dim[::-1], self._transpose
+        transpose(gmres.flat(k.preconditioned), k.corrected)
         k.image.zero_()
-        self._tell("zeros")
         found = (a.stored, k.corrected, k.image)
         self._launch(self._product, elements, k.running, self._rows.single, *found, block=BLOCK)
         if self._barrier is not None:
@@ -235,10 +225,7 @@ class BatchedSolver:
             self._launch(barrier_product, elements, k.running, *where, k.corrected, k.image)
         contact = (a.touching, self._rows.face_row, self._rows.face_shape, a.stored_contact)
         self._launch(self._contact_product, self._face_dim, k.running, *contact, k.corrected, k.image)
-        preconditioner.dense.transpose(k.image, gmres.flat(k.product))
-        self._tell("transpose")
-        self._part = "krylov"
-        self._launch_blocks(self._arnoldi, self._block, k)
+        transpose(k.image, gmres.flat(k.product))
 
     def fill(self, presses: Mapping[int, Press]) -> None:
         """Begin presses, by lane."""
