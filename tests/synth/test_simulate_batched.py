@@ -16,7 +16,7 @@ from synth.press.press import Press
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.batched import simulate_presses
-from synth.simulate.batched.arrays import number_rows
+from synth.simulate.batched.arrays import single_tables
 from synth.simulate.batched.krylov import padded
 from synth.simulate.batched.lane_orders import Number, Order
 from synth.simulate.batched.pad import prepare
@@ -198,7 +198,7 @@ def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, sti
     given, zeros, launch = (partial(call, device="cpu") for call in (warp_array, wp.zeros, wp.launch))
     rows, elements, points = padded(len(body.free)), (len(mesh.tets), 1), at_rest.gap.shape
     tables, faces = bulk_tables(space, material, body.mixed, "cpu"), face_tables(space, "cpu")
-    numbering = number_rows(space, body.free, rows, tables, "cpu")
+    single = single_tables(space, body.free, rows, tables, "cpu")
     x = np.zeros((rows, 1), dtype=np.float32)
     x[: len(body.free), 0] = rng.standard_normal(len(body.free))
     vector, image = given(x, wp.float32), zeros((rows, 1), wp.float32)
@@ -207,13 +207,13 @@ def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, sti
     inputs = [mask, displacement, given(state.p[None], wp.float64), tables, given(np.array([0.7]), wp.float64)]
     launch(store_bulk, elements, inputs, [stored])
     kernel = bulk_product(space.nodes.shape[1], body.mixed, space.element.stabilisation > 0, any(stiffening))
-    launch(kernel, elements, [mask, numbering.single, stored, vector], [image])
+    launch(kernel, elements, [mask, single, stored, vector], [image])
     barrier = barrier_tables(space, material, "cpu")
     if barrier is not None:
         inverting = zeros(elements, wp.int32)
         launch(find_inverting, elements, [mask, displacement, barrier], [inverting])
         assert inverting.numpy().any()
-        inputs = [mask, inverting, displacement, barrier, numbering.single.row, vector]
+        inputs = [mask, inverting, displacement, barrier, single, vector]
         launch(barrier_product, elements, inputs, [image])
     touching = zeros(points[:2], wp.int32)
     symmetric, remainder = (zeros(points, wp.mat33d) for _ in range(2))
@@ -222,7 +222,7 @@ def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, sti
     launch(contact_stiffness, points[:2], inputs, [touching, symmetric, remainder])
     assert (touching.numpy() == 2).any()
     launch(store_contact, points[:2], [mask, touching, faces.weight, symmetric, remainder], [contact])
-    inputs = [mask, touching, numbering.face_row, numbering.face_shape, contact, vector]
+    inputs = [mask, touching, single, contact, vector]
     launch(contact_product(space.faces.shape[1]), points[:2], inputs, [image])
     expected = tangent @ x[: len(body.free), 0].astype(np.float64)
     # Sums of some 100 products rounded to 6e-8, of terms some times larger than the sum.

@@ -4,7 +4,6 @@ Rows of the vectors: three for each free node's displacement, then the pressures
 zero. Most of the memory is contact's and the Krylov basis.
 """
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +18,7 @@ from synth.simulate.batched.reductions import SCALARS
 from synth.simulate.bulk import Bulk
 from synth.simulate.contact_friction import ContactState, Indenters
 from synth.simulate.space import Space
-from synth.simulate.tables import struct_of, warp_array, zeros_of
+from synth.simulate.tables import struct_of, zeros_of
 
 
 class BatchArrays:
@@ -92,46 +91,24 @@ def by_node(values: wp.array, nodes: int) -> ByNode:
     return ByNode(u, p)
 
 
-@dataclass(frozen=True)
-class UnknownRows:
-    """See the module's docstring; Warp arrays.
-
-    Attributes:
-        free: (rows,) number of the unknown, displacements of all nodes first; -1 where there is none.
-        row: (3 n + k,) the other way round; -1 where the unknown is held.
-        face_row: (f, ns) first rows of a face's nodes. face_shape: (nq, ns) float32.
-        single: tables of the elements.
-    """
-
-    free: wp.array
-    row: wp.array
-    face_row: wp.array
-    face_shape: wp.array
-    single: SingleTables
-
-
-def number_rows(space: Space, free: np.ndarray, rows: int, bulk: Bulk, device: str) -> UnknownRows:
+def single_tables(space: Space, free: np.ndarray, rows: int, bulk: Bulk, device: str) -> SingleTables:
     """Number the free unknowns (k,), displacements first, of a space in vectors of so many rows.
 
     ValueError where a node is held in some directions only.
     """
-    nodes, element, mixed = len(space.points), space.element, bool(bulk.mixed)
+    nodes, mixed = len(space.points), bool(bulk.mixed)
     row = np.full(3 * nodes + (space.pressures if mixed else 0), -1, dtype=np.int32)
     row[free] = np.arange(len(free))
     moving, pressure_row = row[: 3 * nodes].reshape(nodes, 3), row[3 * nodes :]
     if not ((moving >= 0).all(axis=1) | (moving < 0).all(axis=1)).all():
         raise ValueError("a batch needs nodes that are held in all directions or in none")
-    padded = np.full(rows, -1, dtype=np.int32)
-    padded[: len(free)] = free
-    rows_of = {
-        "row": moving[space.nodes, 0],
+    tables = {
+        "unknown": np.pad(free, (0, rows - len(free)), constant_values=-1),
+        "row": row,
+        "element_row": moving[space.nodes, 0],
         "pressure_row": pressure_row[space.pressure_nodes] if mixed else np.zeros((0, 4)),
+        "face_row": moving[space.faces, 0],
+        "face_shape": space.element.face_shape,
+        **{name: getattr(bulk, name).numpy() for name in ("gradient", "pressure_shape", "stabilisation")},
     }
-    shapes = {name: getattr(bulk, name).numpy() for name in ("gradient", "pressure_shape", "stabilisation")}
-    return UnknownRows(
-        free=warp_array(padded, wp.int32, device),
-        row=warp_array(row, wp.int32, device),
-        face_row=warp_array(moving[space.faces, 0], wp.int32, device),
-        face_shape=warp_array(element.face_shape.astype(np.float32), wp.float32, device),
-        single=struct_of(SingleTables, device, **rows_of, **shapes),
-    )
+    return struct_of(SingleTables, device, **tables)

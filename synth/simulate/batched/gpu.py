@@ -204,16 +204,9 @@ def _invert_by_cusolver(factors: wp.array, found: wp.array) -> None:
                 raise np.linalg.LinAlgError("Singular matrix")
             for first in range(0, n, COLUMNS):
                 columns = unit_rows(min(COLUMNS, n - first), n, first, device)
-                right = (
-                    ctypes.c_int64(len(columns)),
-                    FLOAT64,
-                    left,
-                    size,
-                    order,
-                    FLOAT64,
-                    ctypes.c_void_p(columns.ptr),
-                )
-                run("cusolverDnXgetrs", handle, settings, 0, size, *right, size, told)
+                right, count = ctypes.c_void_p(columns.ptr), ctypes.c_int64(len(columns))
+                wanted = (size, count, FLOAT64, left, size, order, FLOAT64, right, size, told)
+                run("cusolverDnXgetrs", handle, settings, 0, *wanted)
                 wp.launch(round_rows, columns.shape, inputs=[columns, first, found], device=device)
             wp.synchronize_device(device)
         finally:

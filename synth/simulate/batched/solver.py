@@ -21,7 +21,7 @@ from synth.arrays import FloatArray
 from synth.press.press import Press
 from synth.simulate.batched import fields, lane_orders, reductions
 from synth.simulate.batched import krylov as gmres
-from synth.simulate.batched.arrays import BatchArrays, number_rows
+from synth.simulate.batched.arrays import BatchArrays, single_tables
 from synth.simulate.batched.lane_orders import PATH_DERIVATIVE_STEP, Order
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.presses import PressTable, padded
@@ -62,7 +62,7 @@ class BatchedSolver:
         self.inner, self._table = inner, PressTable(batch, device)
         self._presses = self._table.on_device()
         self._barrier = barrier_tables(space, material, device)
-        self._rows = number_rows(space, pad.free, rows, self._bulk, device)
+        self._single = single_tables(space, pad.free, rows, self._bulk, device)
         surface = nodal_weights(space, self._faces.weight.numpy())
         self._surface = struct_of(reductions.SurfaceTables, device, **surface)
         self._product = bulk_product(space.nodes.shape[1], pad.mixed, space.element.stabilisation > 0, pad.yeoh)
@@ -167,7 +167,7 @@ class BatchedSolver:
         if self._told(Order.ACCEPT):
             self._update_contact_history(a.state.u, 0)
         if self._told(Order.PREDICT):
-            where = (PATH_DERIVATIVE_STEP, a.step, self._rows.row, a.fields)
+            where = (PATH_DERIVATIVE_STEP, a.step, self._single.row, a.fields)
             self._launch(fields.apply_predictor, self._value_dim, a.mask, *where)
         if self._told(Order.AUGMENT):
             found = (a.indenters, a.gap, a.tangential, PENALTY, a.contact)
@@ -181,7 +181,7 @@ class BatchedSolver:
     def _evaluate(self) -> None:
         """Evaluate the residuals of iterates and trials."""
         a = self._arrays
-        mask, elements, row, u = a.mask, self._element_dim, self._rows.row, a.trial.u
+        mask, elements, row, u = a.mask, self._element_dim, self._single.row, a.trial.u
         trial = (a.share, a.step, row, a.fields, a.residual, a.viscous)
         self._launch(fields.compute_trial, self._value_dim, mask, *trial)
         self._launch(bulk_residual, elements, *a.trial, mask, self._bulk, *a.forces, a.jacobian)
@@ -205,7 +205,7 @@ class BatchedSolver:
         self._launch(contact_stiffness, self._face_dim, u, mask, *law, np.inf, a.touching, *matrices)
         stored = (a.touching, self._faces.weight, *matrices, a.stored_contact)
         self._launch(store_contact, self._face_dim, mask, *stored)
-        right = (self._rows.free, a.residual, a.krylov)
+        right = (self._single.unknown, a.residual, a.krylov)
         self._launch(gmres.begin_solves, a.krylov.step.shape, mask, a.numbers, *right)
 
     def _iterate(self) -> None:
@@ -219,11 +219,11 @@ class BatchedSolver:
         transpose(gmres.flat(k.preconditioned), k.corrected)
         k.image.zero_()
         found = (a.stored, k.corrected, k.image)
-        self._launch(self._product, elements, k.running, self._rows.single, *found, block=BLOCK)
+        self._launch(self._product, elements, k.running, self._single, *found, block=BLOCK)
         if self._barrier is not None:
-            where = (a.inverting, a.iterate.u, self._barrier, self._rows.single.row)
+            where = (a.inverting, a.iterate.u, self._barrier, self._single)
             self._launch(barrier_product, elements, k.running, *where, k.corrected, k.image)
-        contact = (a.touching, self._rows.face_row, self._rows.face_shape, a.stored_contact)
+        contact = (a.touching, self._single, a.stored_contact)
         self._launch(self._contact_product, self._face_dim, k.running, *contact, k.corrected, k.image)
         transpose(k.image, gmres.flat(k.product))
 
