@@ -80,22 +80,10 @@ def trajectory(
 
 
 def _state(press: Press, told: Record, row: FloatArray, space: Space) -> State:
-    pose, modulus_mpa = press.path.pose(told.at_mm), press.scene.sensor.gel.youngs_modulus_kpa / 1000
-    scalars, fields = row[:SCALARS].tolist(), row[SCALARS:]
-    end = 3 * len(space.points)
-    fx, fy, fz, mx, my, mz = (modulus_mpa * value for value in scalars[:6])
-    touching, slipping = scalars[6:]
-    return State(
-        depth_mm=pose.depth_mm,
-        shear_mm=pose.shear_mm,
-        twist_deg=pose.twist_deg,
-        displacement=fields[:end].reshape(-1, 3).copy(),
-        traction=modulus_mpa * fields[end:].reshape(-1, 3),
-        force_n=(fx, fy, fz),
-        torque_nmm=(mx, my, mz),
-        newton_iterations=told.iterations,
-        residual=told.evaluation.relative,
-        min_jacobian=told.evaluation.smallest_jacobian,
-        max_penetration_mm=told.evaluation.deepest_mm,
-        slip_ratio=slipping / touching if touching > 0 else 0.0,
-    )
+    end = SCALARS + 3 * len(space.points)
+    loads = row[:3], row[3:6], row[end:].reshape(-1, 3)
+    touching, slipping = row[6:SCALARS].tolist()
+    ratio = slipping / touching if touching > 0 else 0.0
+    modulus_mpa = press.scene.sensor.gel.youngs_modulus_kpa / 1000
+    displacement = row[SCALARS:end].reshape(-1, 3).copy()
+    return State.of(told, press.path.pose(told.at_mm), displacement, loads, modulus_mpa, ratio)
