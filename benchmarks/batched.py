@@ -12,11 +12,13 @@ displacement, and of the force. That is done by the solver for one sample, which
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cache, partial
 from itertools import cycle, islice, pairwise
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import warp as wp
@@ -33,7 +35,7 @@ from synth.simulate.batched.gpu import dense
 from synth.simulate.batched.krylov import RUNNING, WAITING
 from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.batched.run import OPTIONS, Run, simulate_presses
-from synth.simulate.batched.solver import INNER_ITERATIONS
+from synth.simulate.batched.solver import INNER_ITERATIONS, BatchedSolver
 
 PLACES_MM = (6.0, 4.0)
 """Half width of the rectangle that the balls' centres are drawn from."""
@@ -118,29 +120,54 @@ def profile(run: Run, device: str) -> Row:
     clock = Events(device) if wp.get_device(device).is_cuda else Clock()
     parts: dict[str, float] = {}
     used = 0
-    for _ in range(PROFILED_CYCLES):
-        before = np.where(krylov.running.numpy() == RUNNING, krylov.k.numpy(), 0)
-        clock.start()
-        run.solver.watch = clock.mark
-        list(run.turn())
-        run.solver.watch = None
-        for part, ms in clock.stop():
-            parts[part] = parts.get(part, 0.0) + ms / PROFILED_CYCLES
-        used += int(np.where(krylov.running.numpy() != WAITING, krylov.k.numpy() - before, 0).sum())
+    with timed(run.solver, clock):
+        for _ in range(PROFILED_CYCLES):
+            before = np.where(krylov.running.numpy() == RUNNING, krylov.k.numpy(), 0)
+            clock.start()
+            list(run.turn())
+            for part, ms in clock.stop():
+                parts[part] = parts.get(part, 0.0) + ms / PROFILED_CYCLES
+            used += int(np.where(krylov.running.numpy() != WAITING, krylov.k.numpy() - before, 0).sum())
     busy = used / (PROFILED_CYCLES * INNER_ITERATIONS * run.solver.batch)
     return {"krylov_busy": round(busy, 3), **{f"ms_{part}": round(ms, 4) for part, ms in parts.items()}}
 
 
+@contextmanager
+def timed(solver: BatchedSolver, clock: "Clock") -> Iterator[None]:
+    """A clock times the parts of the solver's cycles, which are then launched kernel by kernel, not as a graph."""
+    parts: list[tuple[Any, str, Callable[..., None], str]] = [
+        (solver, "_solve_and_evaluate", solver._launch_all, "krylov"),
+        (solver, "_linearise", solver._linearise, "tangent"),
+        (solver.pad.preconditioner, "apply", solver.pad.preconditioner.apply, "preconditioner"),
+        (solver, "_multiply", solver._multiply, "product"),
+        (solver, "_evaluate", solver._evaluate, "residual"),
+    ]
+    with ExitStack() as patched:
+        for owner, name, method, part in parts:
+            patched.enter_context(patch.object(owner, name, clock.within(part)(method)))
+        yield
+
+
 class Clock:
-    """Times between marks on the CPU, where a launch ends when the kernel does."""
+    """Times of the parts of a cycle on the CPU, where a launch ends when the kernel does."""
 
     def start(self) -> None:
-        """Begin."""
+        """Begin; what is in no other part is `stepping`."""
+        self._part = "stepping"
         self._marks: list[tuple[str, Any]] = [("", self._now())]
 
-    def mark(self, part: str, kernel: str) -> None:
-        """Note that a kernel of a part ran, or was queued, since the last mark."""
-        self._marks.append((part, self._now()))
+    @contextmanager
+    def within(self, part: str) -> Iterator[None]:
+        """A part that may lie within another one, which goes on behind it."""
+        outer = self._part
+        self._mark()
+        self._part = part
+        yield
+        self._mark()
+        self._part = outer
+
+    def _mark(self) -> None:
+        self._marks.append((self._part, self._now()))
 
     def stop(self) -> list[tuple[str, float]]:
         """Part and ms of each mark."""

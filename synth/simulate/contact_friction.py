@@ -214,9 +214,9 @@ def contact_stiffness(
     max_turn: most (rad) that H turns a mesh's normal over what a point is deeper than its multiplier says.
     """
     s, f = wp.tid()
-    touching[s, f] = 0
     if active[s] == 0:
         return
+    touching[s, f] = 0
     if _is_far(faces, indenters, u, s, f):
         return
     rotation = indenters.rotation[s]

@@ -7,7 +7,6 @@ from typing import Any, cast
 
 import numpy as np
 
-from synth.arrays import FloatArray
 from synth.press.load_path import LoadPath
 from synth.simulate.contact_friction import Indenters
 from synth.simulate.linear import norm
@@ -16,7 +15,7 @@ from synth.simulate.policy.load_steps import LoadSteps
 from synth.simulate.policy.newton import NEAR
 from synth.simulate.system import Residual, System, Unknowns
 from synth.simulate.tables import pack_indenter, place_indenter
-from synth.simulate.trajectory import State, Trajectory, at_rest
+from synth.simulate.trajectory import Loads, State, Trajectory, at_rest
 
 MAX_ROUGH_ITERATIONS = 5
 """Iterations after which directions are exact: far from the solution rough ones may not get there at all."""
@@ -227,29 +226,11 @@ class DirectPress(DirectSolver):
         step = self.system.newton_step(tangent, moved)
         return state.plus(step, 1 / ask.PATH_DERIVATIVE_STEP) if np.isfinite(step.u).all() else state
 
-    def _forces(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _forces(self) -> Loads:
         return self.system.forces(self.iterate.state, self.iterate.residual)
 
     def _recorded(self, wanted: ask.Record) -> State:
         """The iterate in the units of a trajectory."""
-        pose, seen = self.path.pose(wanted.at_mm), wanted.evaluation
-        force, torque, traction = (self._modulus * value for value in self._forces())
-        return State(
-            depth_mm=pose.depth_mm,
-            shear_mm=pose.shear_mm,
-            twist_deg=pose.twist_deg,
-            displacement=self.iterate.state.u,
-            traction=traction,
-            force_n=_triple(force),
-            torque_nmm=_triple(torque),
-            newton_iterations=wanted.iterations,
-            residual=seen.relative,
-            min_jacobian=seen.smallest_jacobian,
-            max_penetration_mm=seen.deepest_mm,
-            slip_ratio=self.system.slip_ratio(self.iterate.residual, self.indenter),
-        )
-
-
-def _triple(values: FloatArray) -> tuple[float, float, float]:
-    x, y, z = map(float, values)
-    return x, y, z
+        pose = self.path.pose(wanted.at_mm)
+        slip_ratio = self.system.slip_ratio(self.iterate.residual, self.indenter)
+        return State.of(wanted, pose, self.iterate.state.u, self._forces(), self._modulus, slip_ratio)

@@ -10,6 +10,7 @@ from synth.simulate.contact_friction import FAR, ON_CONE, ContactState, Faces, I
 
 @wp.kernel
 def augment(
+    active: wp.array(dtype=wp.int32),
     share: wp.array(dtype=wp.float64),
     indenters: Indenters,
     gap: wp.array3d(dtype=wp.float64),
@@ -22,7 +23,7 @@ def augment(
     The next solution then needs less penetration and elastic slip.
     """
     s, f, q = wp.tid()
-    if share[s] == wp.float64(0.0):
+    if active[s] == 0:
         return
     stiffness = penalty * indenters.sharpness[s]
     before = state.normal[s, f, q]

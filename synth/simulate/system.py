@@ -217,7 +217,9 @@ class System:
     def augment(self, at: Residual, indenter: Indenters, share: float = 1.0) -> None:
         """Augmented-Lagrangian update at a solution, by its residual: a share of it, 1 for all of it."""
         amount = _array(np.array([share]), wp.float64)
-        _launch(augment, self._points, amount, indenter, at.gap, at.tangential, self.penalty, self.contact)
+        _launch(
+            augment, self._points, self._active, amount, indenter, at.gap, at.tangential, self.penalty, self.contact
+        )
 
     def update_contact_history(self, state: Unknowns, at: Residual, indenter: Indenters, new_only: int = 0) -> None:
         """Accept a step: friction's anchors follow. If new_only, points that touch for the first time are anchored.

@@ -12,7 +12,11 @@ from synth.dataset.atomic_files import replace_file, storage_errors
 from synth.press.load_path import LoadPath, Pose
 from synth.scene import Scene
 from synth.simulate.contact_patch import ContactPatch
+from synth.simulate.policy.requests import Record
 from synth.simulate.space import Space
+
+Loads = tuple[FloatArray, FloatArray, FloatArray]
+"""Force (3,) and moment about the frame's origin (3,) of the indenter on the gel, and tractions (s, 3)."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +48,36 @@ class State:
     max_penetration_mm: float
     slip_ratio: float
 
+    @classmethod
+    def of(
+        cls, record: Record, pose: Pose, displacement: FloatArray, loads: Loads, modulus_mpa: float, slip_ratio: float
+    ) -> "State":
+        """A state that the policy has recorded, from its displacement and its loads in units of Young's modulus."""
+        force, torque, traction = (modulus_mpa * load for load in loads)
+        return cls(
+            depth_mm=pose.depth_mm,
+            shear_mm=pose.shear_mm,
+            twist_deg=pose.twist_deg,
+            displacement=displacement,
+            traction=traction,
+            force_n=_triple(force),
+            torque_nmm=_triple(torque),
+            newton_iterations=record.iterations,
+            residual=record.evaluation.relative,
+            min_jacobian=record.evaluation.smallest_jacobian,
+            max_penetration_mm=record.evaluation.deepest_mm,
+            slip_ratio=slip_ratio,
+        )
+
     def summary(self) -> dict[str, Any]:
         """The state without its fields, as trajectory.json has it."""
         numbers = {name: value for name, value in vars(self).items() if name not in ("displacement", "traction")}
         return {**numbers, "converged": True}
+
+
+def _triple(values: FloatArray) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z
 
 
 def at_rest(path: LoadPath, space: Space) -> list[State]:

@@ -16,8 +16,9 @@ from synth.press.press import Press
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.batched import simulate_presses
-from synth.simulate.batched.arrays import number_rows
+from synth.simulate.batched.arrays import single_tables
 from synth.simulate.batched.krylov import padded
+from synth.simulate.batched.lane_orders import Number, Order
 from synth.simulate.batched.pad import prepare
 from synth.simulate.batched.product import (
     STORED_YEOH,
@@ -28,8 +29,8 @@ from synth.simulate.batched.product import (
     store_bulk,
     store_contact,
 )
-from synth.simulate.batched.run import OPTIONS, Asked
-from synth.simulate.contact_friction import contact_stiffness
+from synth.simulate.batched.run import OPTIONS, Asked, Run
+from synth.simulate.contact_friction import FAR, contact_stiffness
 from synth.simulate.material import uniform
 from synth.simulate.options import SolverOptions
 from synth.simulate.space import function_space
@@ -102,6 +103,23 @@ def test_company_order_and_lost_samples_change_no_bit() -> None:
     first, second = simulate_scenes([lost, good], thin)
     assert (first.status, "did not converge" in first.reason) == ("partial", True)
     assert same(second, simulate_scenes([good], thin)[0])
+
+
+def test_a_lane_goes_back_to_its_snapshots_and_begins_afresh() -> None:
+    press = Press.of(scene(friction=0.4), MESH)
+    solver = Run([(0, (press, None))], iter([]), prepare(press.scene, MESH, "cpu"), OPTIONS).solver
+    contact, iterate = solver._arrays.contact, solver._arrays.fields.iterate
+    changing = (iterate, contact.normal, contact.tangent, contact.anchor, contact.anchored)
+    for keep, restore in ((Order.KEEP_PASS, Order.RESTORE_PASS), (Order.KEEP_STEP, Order.RESTORE_STEP)):
+        for order, value in ((keep, 1), (restore, 2)):
+            for array in changing:
+                array.fill_(value)
+            solver.begin_cycle(np.array([order]), np.zeros((1, len(Number))))
+        assert all((array.numpy() == 1).all() for array in changing)
+    contact.gap.zero_()
+    solver.fill({0: press})
+    assert (contact.gap.numpy() == FAR).all()
+    assert not any(array.numpy().any() for array in (contact.normal, contact.tangent, contact.anchored))
 
 
 def test_a_press_that_records_more_waits_for_a_run_with_room_for_it() -> None:
@@ -180,7 +198,7 @@ def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, sti
     given, zeros, launch = (partial(call, device="cpu") for call in (warp_array, wp.zeros, wp.launch))
     rows, elements, points = padded(len(body.free)), (len(mesh.tets), 1), at_rest.gap.shape
     tables, faces = bulk_tables(space, material, body.mixed, "cpu"), face_tables(space, "cpu")
-    numbering = number_rows(space, body.free, rows, tables, "cpu")
+    single = single_tables(space, body.free, rows, tables, "cpu")
     x = np.zeros((rows, 1), dtype=np.float32)
     x[: len(body.free), 0] = rng.standard_normal(len(body.free))
     vector, image = given(x, wp.float32), zeros((rows, 1), wp.float32)
@@ -189,22 +207,22 @@ def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, sti
     inputs = [mask, displacement, given(state.p[None], wp.float64), tables, given(np.array([0.7]), wp.float64)]
     launch(store_bulk, elements, inputs, [stored])
     kernel = bulk_product(space.nodes.shape[1], body.mixed, space.element.stabilisation > 0, any(stiffening))
-    launch(kernel, elements, [mask, numbering.single, stored, vector], [image])
+    launch(kernel, elements, [mask, single, stored, vector], [image])
     barrier = barrier_tables(space, material, "cpu")
     if barrier is not None:
         inverting = zeros(elements, wp.int32)
         launch(find_inverting, elements, [mask, displacement, barrier], [inverting])
         assert inverting.numpy().any()
-        inputs = [mask, inverting, displacement, barrier, numbering.single.row, vector]
+        inputs = [mask, inverting, displacement, barrier, single, vector]
         launch(barrier_product, elements, inputs, [image])
-    touching, touched = (zeros(points[:2], wp.int32) for _ in range(2))
+    touching = zeros(points[:2], wp.int32)
     symmetric, remainder = (zeros(points, wp.mat33d) for _ in range(2))
     contact = zeros(points, wp.mat33f)
     inputs = [displacement, mask, faces, bodies, body.contact, body.penalty, np.inf]
     launch(contact_stiffness, points[:2], inputs, [touching, symmetric, remainder])
     assert (touching.numpy() == 2).any()
-    launch(store_contact, points[:2], [mask, touching, faces.weight, symmetric, remainder], [contact, touched])
-    inputs = [mask, touched, numbering.face_row, numbering.face_shape, contact, vector]
+    launch(store_contact, points[:2], [mask, touching, faces.weight, symmetric, remainder], [contact])
+    inputs = [mask, touching, single, contact, vector]
     launch(contact_product(space.faces.shape[1]), points[:2], inputs, [image])
     expected = tangent @ x[: len(body.free), 0].astype(np.float64)
     # Sums of some 100 products rounded to 6e-8, of terms some times larger than the sum.

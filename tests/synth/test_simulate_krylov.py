@@ -10,7 +10,7 @@ from pads import SIZE, brick, scene
 
 from synth.press.press import Press
 from synth.simulate.batched import krylov as kernels
-from synth.simulate.batched.gpu import dense, inverse
+from synth.simulate.batched.gpu import dense, inverse, unit_rows
 from synth.simulate.batched.krylov import Krylov, arnoldi, block_size, flat, padded, round_rows
 from synth.simulate.batched.lane import Lane
 from synth.simulate.batched.lane_orders import Number, Order, Seen, select
@@ -20,31 +20,36 @@ from synth.simulate.policy.load_steps import LoadSteps
 from synth.simulate.policy.requests import Solve
 
 
-def _systems(batch: int, device: str = "cpu") -> tuple[Krylov, list[Any]]:
-    """Lanes at the start of a linear solve, its right side of norm 1, and their mask and numbers."""
-    krylov, sizes = Krylov(), kernels.shapes(padded(150), batch)
+def _systems(batch: int, device: str = "cpu", residual: np.ndarray | None = None) -> Krylov:
+    """Lanes at the start of a linear solve, for residuals (batch, 150) that are told to be of norm 1."""
+    rows = padded(150)
+    krylov, sizes = Krylov(), kernels.shapes(rows, batch)
     for name, variable in Krylov.vars.items():
         setattr(krylov, name, wp.zeros(sizes[name], dtype=variable.type.dtype, device=device))
+    residual = np.zeros((batch, 150)) if residual is None else residual
     numbers = np.zeros((batch, len(Number)))
     numbers[:, [Number.NORM, Number.GOAL]] = 1.0, 1e-3
-    told = [wp.ones(batch, dtype=wp.int32, device=device), wp.array(numbers, dtype=wp.float64, device=device)]
-    wp.launch(kernels.begin_solve, batch, inputs=[*told, krylov], device=device)
-    return krylov, told
+    free = np.append(np.arange(150), np.full(rows - 150, -1))
+    given = (np.ones(batch), wp.int32), (numbers, wp.float64), (free, wp.int32), (residual, wp.float64)
+    inputs = [wp.array(values, dtype=dtype, device=device) for values, dtype in given]
+    wp.launch(kernels.begin_solves, (batch, rows // 4), inputs=[*inputs, krylov], device=device)
+    return krylov
 
 
 def test_lanes_are_selected_by_their_orders() -> None:
     orders, mask = (wp.array(values, dtype=wp.int32, device="cpu") for values in (np.arange(8), np.zeros(8)))
-    wp.launch(select, 8, inputs=[orders, int(Order.RESTORE_PASS | Order.REPEAT), mask], device="cpu")
+    wp.launch(select, 8, inputs=[orders, Order.RESTORE_PASS | Order.REPEAT, mask], device="cpu")
     assert mask.numpy().tolist() == [0, 0, 1, 1, 1, 1, 1, 1]
 
 
 def test_linear_solves_are_as_exact_as_newton_needs() -> None:
     """The first; after a fall to a twentieth 0.9 / 400; near the tolerance 0.3 times what is left; the most."""
     posed = scene()
-    steps = LoadSteps(Press.of(posed, brick()).path, SIZE, False, posed.numerics, STANDARD)
+    press = Press.of(posed, brick())
+    steps = LoadSteps(press.path, SIZE, False, posed.numerics, STANDARD)
 
     def goals(forcing: float, *solves: tuple[float, int]) -> list[float]:
-        lane = Lane(0, steps, np.zeros(len(Number)), forcing)
+        lane = Lane(0, press, steps, np.zeros(len(Number)), forcing)
         return [lane._goal(Solve(relative, 1e-4, iteration), 1 / 20) for relative, iteration in solves]
 
     given = ((1.0, 0), (1.0, 1), (5e-3, 1), (2e-4, 1))
@@ -67,7 +72,7 @@ def test_every_lane_solves_its_own_system(device: str, batch: int) -> None:
     rights /= np.linalg.norm(rights, axis=1, keepdims=True)
 
     def solved(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        krylov, _ = _systems(len(which), device)
+        krylov = _systems(len(which), device)
         krylov.goal.assign(goals[which])
         first = np.zeros(flat(krylov.current).shape, dtype=np.float32)
         first[:, :size] = rights[which]
@@ -101,7 +106,7 @@ def test_every_lane_solves_its_own_system(device: str, batch: int) -> None:
 
 
 def test_a_solve_that_misses_its_goal_ends_at_the_limit() -> None:
-    krylov, _ = _systems(1)
+    krylov = _systems(1)
     krylov.goal.fill_(0.0)
     krylov.k.fill_(GMRES_LIMIT - 2)
     product = flat(krylov.product)
@@ -139,13 +144,8 @@ def test_a_preconditioner_takes_tf32_from_the_first_vector_on() -> None:
     np.testing.assert_allclose(found[:150, :150], np.linalg.inv(matrix + matrix.T), rtol=1 / 2000)
     assert np.count_nonzero(found) == np.count_nonzero(found[:150, :150])
     assert (_bits(found) == 0).all()
-    krylov, told = _systems(2)
+    krylov = _systems(2, residual=rng.standard_normal((2, 150)))
     rows = flat(krylov.current).shape[1]
-    free = np.append(np.arange(150), np.full(rows - 150, -1)).astype(np.int32)
-    force = wp.array(rng.standard_normal((2, 50, 3)), dtype=wp.vec3d, device="cpu")
-    volume = wp.zeros((2, 0), dtype=wp.float64, device="cpu")
-    inputs = [*told, wp.array(free, device="cpu"), force, volume, krylov]
-    wp.launch(kernels.begin_vectors, (2, rows // 4), inputs=inputs, device="cpu")
     first = flat(krylov.current).numpy().copy()
     flat(krylov.product).assign(rng.standard_normal((2, rows)).astype(np.float32))
     wp.launch_tiled(arnoldi(rows), dim=[2], inputs=[krylov], block_dim=block_size(rows), device="cpu")
@@ -181,6 +181,12 @@ def test_dense_operations_on_a_gpu(rows: int, batch: int) -> None:
     true = x[some].astype(np.float64) @ a.astype(np.float64)
     off = np.linalg.norm(product.numpy()[some] - true, axis=1) / np.linalg.norm(true, axis=1)
     assert (off < 4e-9 * rows).all()
+
+
+def test_right_sides_of_an_inverse_are_unit_vectors() -> None:
+    """A full block of them, and what is left over at the end."""
+    for count, first in ((4, 0), (4, 4), (2, 8)):
+        np.testing.assert_array_equal(unit_rows(count, 10, first, wp.get_device("cpu")), np.eye(count, 10, first))
 
 
 @pytest.mark.cuda

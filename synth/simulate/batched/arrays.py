@@ -4,8 +4,7 @@ Rows of the vectors: three for each free node's displacement, then the pressures
 zero. Most of the memory is contact's and the Krylov basis.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -19,7 +18,7 @@ from synth.simulate.batched.reductions import SCALARS
 from synth.simulate.bulk import Bulk
 from synth.simulate.contact_friction import ContactState, Indenters
 from synth.simulate.space import Space
-from synth.simulate.tables import struct_of, warp_array, zeros_of
+from synth.simulate.tables import struct_of, zeros_of
 
 
 class BatchArrays:
@@ -34,34 +33,39 @@ class BatchArrays:
         def zeros(shape: int | tuple[int, ...], dtype: Any) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        nodes, pressures, elements = len(space.points), space.pressures if pad.mixed else 0, len(space.nodes)
+        self.nodes, elements = len(space.points), len(space.nodes)
+        values = (batch, 3 * self.nodes + (space.pressures if pad.mixed else 0))
         self.points = (batch, len(space.faces), len(space.element.face_weights))
         self.orders, self.numbers = zeros(batch, wp.int32), zeros((batch, len(Number)), wp.float64)
-        self.seen = zeros((batch, len(Seen)), wp.float64)
-        self.viscosity, self.shares = zeros(batch, wp.float64), zeros(batch, wp.float64)
-        self.fields: Fields = zeros_of(Fields, lambda n: (batch, nodes if n.endswith("_u") else pressures), device)
+        self.seen = zeros((batch, Seen.FORCE + SCALARS), wp.float64)
+        self.sums = self.seen[:, Seen.FORCE :]
+        self.viscosity, self.stiffness = (self.numbers[:, n] for n in (Number.VISCOSITY, Number.STIFFNESS))
+        self.asked_share, self.share = self.numbers[:, Number.SHARE], zeros(batch, wp.float64)
+        self.fields: Fields = zeros_of(Fields, lambda _: values, device)
+        self.residual, self.viscous = zeros(values, wp.float64), zeros(values, wp.float64)
+        self.state, self.iterate, self.trial, self.forces, self.viscous_forces = (
+            by_node(each, self.nodes)
+            for each in (self.fields.state, self.fields.iterate, self.fields.trial, self.residual, self.viscous)
+        )
         self.contact: ContactState = zeros_of(ContactState, lambda _: self.points, device)
-        self.saved: ContactMemory = zeros_of(ContactMemory, lambda _: self.points, device)
-        self.force, self.volume = zeros((batch, nodes), wp.vec3d), zeros((batch, pressures), wp.float64)
-        self.viscous = zeros((batch, nodes), wp.vec3d)
+        self.after_step, self.before_pass = (zeros_of(ContactMemory, lambda _: self.points, device) for _ in range(2))
         self.jacobian = zeros((batch, elements), wp.float64)
         self.gap, self.tangential = zeros(self.points, wp.float64), zeros(self.points, wp.vec3d)
+        self.gaps = self.gap.reshape((batch, -1))
         self.memory = ContactMemory()
         self.memory.gap, self.memory.tangential = self.gap, self.tangential
         for name in ("normal", "tangent", "anchor", "anchored"):
             setattr(self.memory, name, getattr(self.contact, name))
         self.traction = zeros(self.points, wp.vec3d)
-        self.normal_before, self.tangent_before = zeros(self.points, wp.float64), zeros(self.points, wp.vec3d)
         self.indenters: Indenters = zeros_of(
             Indenters, lambda name: (batch, *grid) if name == "coefficients" else (batch,), device
         )
-        self.records = zeros((batch, records, SCALARS + 3 * nodes + 3 * len(space.surface_nodes)), wp.float64)
-        self.sums = zeros((batch, 8), wp.float64)
-        self.mask, self.found = zeros(batch, wp.int32), zeros(batch, wp.int32)
+        self.records = zeros((batch, records, SCALARS + 3 * self.nodes + 3 * len(space.surface_nodes)), wp.float64)
+        self.mask = zeros(batch, wp.int32)
         stored = (elements, len(space.element.weights), STORED_YEOH if pad.yeoh else STORED, batch)
         self.stored = zeros(stored, wp.float32)
         self.inverting = zeros((elements, batch), wp.int32)
-        self.touching, self.touched = zeros(self.points[:2], wp.int32), zeros(self.points[:2], wp.int32)
+        self.touching = zeros(self.points[:2], wp.int32)
         self.symmetric, self.remainder = zeros(self.points, wp.mat33d), zeros(self.points, wp.mat33d)
         self.stored_contact = zeros(self.points, wp.mat33f)
         sizes = shapes(pad.preconditioner.rows, batch)
@@ -69,48 +73,42 @@ class BatchArrays:
         self.step = flat(self.krylov.step)
 
 
-@dataclass(frozen=True)
-class UnknownRows:
-    """See the module's docstring; Warp arrays.
+class ByNode(NamedTuple):
+    """Views of values (B, 3 n + k): displacements, or forces, `u` (B, n) of vec3d, and `p` (B, k)."""
 
-    Attributes:
-        free: (rows,) number of the unknown, displacements of all nodes first; -1 where there is none.
-        node_row: (n,) first row of a node, -1 where it is held. pressure_row: (k,).
-        face_row: (f, ns) first rows of a face's nodes. face_shape: (nq, ns) float32.
-        single: tables of the elements.
-    """
-
-    free: wp.array
-    node_row: wp.array
-    pressure_row: wp.array
-    face_row: wp.array
-    face_shape: wp.array
-    single: SingleTables
+    u: wp.array
+    p: wp.array
 
 
-def number_rows(space: Space, free: np.ndarray, rows: int, bulk: Bulk, device: str) -> UnknownRows:
+def by_node(values: wp.array, nodes: int) -> ByNode:
+    """These views, which do not keep the values alive."""
+    lanes, pressures = len(values), values.shape[1] - 3 * nodes
+    row, device = values.strides[0], values.device
+    u = wp.array(ptr=values.ptr, dtype=wp.vec3d, shape=(lanes, nodes), strides=(row, 24), device=device)
+    p = wp.array(
+        ptr=values.ptr + 24 * nodes, dtype=wp.float64, shape=(lanes, pressures), strides=(row, 8), device=device
+    )
+    return ByNode(u, p)
+
+
+def single_tables(space: Space, free: np.ndarray, rows: int, bulk: Bulk, device: str) -> SingleTables:
     """Number the free unknowns (k,), displacements first, of a space in vectors of so many rows.
 
     ValueError where a node is held in some directions only.
     """
-    nodes, element, mixed = len(space.points), space.element, bool(bulk.mixed)
+    nodes, mixed = len(space.points), bool(bulk.mixed)
     row = np.full(3 * nodes + (space.pressures if mixed else 0), -1, dtype=np.int32)
     row[free] = np.arange(len(free))
     moving, pressure_row = row[: 3 * nodes].reshape(nodes, 3), row[3 * nodes :]
     if not ((moving >= 0).all(axis=1) | (moving < 0).all(axis=1)).all():
         raise ValueError("a batch needs nodes that are held in all directions or in none")
-    padded = np.full(rows, -1, dtype=np.int32)
-    padded[: len(free)] = free
-    rows_of = {
-        "row": moving[space.nodes, 0],
+    tables = {
+        "unknown": np.pad(free, (0, rows - len(free)), constant_values=-1),
+        "row": row,
+        "element_row": moving[space.nodes, 0],
         "pressure_row": pressure_row[space.pressure_nodes] if mixed else np.zeros((0, 4)),
+        "face_row": moving[space.faces, 0],
+        "face_shape": space.element.face_shape,
+        **{name: getattr(bulk, name).numpy() for name in ("gradient", "pressure_shape", "stabilisation")},
     }
-    shapes = {name: getattr(bulk, name).numpy() for name in ("gradient", "pressure_shape", "stabilisation")}
-    return UnknownRows(
-        free=warp_array(padded, wp.int32, device),
-        node_row=warp_array(moving[:, 0], wp.int32, device),
-        pressure_row=warp_array(pressure_row, wp.int32, device),
-        face_row=warp_array(moving[space.faces, 0], wp.int32, device),
-        face_shape=warp_array(element.face_shape.astype(np.float32), wp.float32, device),
-        single=struct_of(SingleTables, device, **rows_of, **shapes),
-    )
+    return struct_of(SingleTables, device, **tables)

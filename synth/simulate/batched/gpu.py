@@ -23,7 +23,7 @@ import scipy.sparse
 import warp as wp
 
 from synth.errors import InputError
-from synth.simulate.batched.krylov import padded, round_rows
+from synth.simulate.batched.krylov import padded, round_rows, scatter
 
 NEEDS = {"cublas": ("cublasLt",), "cusolver": ("nvJitLink", "cusparse", "cublas")}
 """Libraries that are loaded before, since a wheel's library does not always know where the others are."""
@@ -154,7 +154,7 @@ def inverse(matrix: scipy.sparse.csr_array, device: str) -> wp.array:
     """
     k, where = matrix.shape[0], wp.get_device(device)
     try:
-        full = wp.array(matrix.toarray(), dtype=wp.float64, device=where)
+        full = filled(matrix, where)
         found = wp.zeros((padded(k), padded(k)), dtype=wp.float32, device=where)
         if where.is_cuda:
             _invert_by_cusolver(full, found)
@@ -166,6 +166,22 @@ def inverse(matrix: scipy.sparse.csr_array, device: str) -> wp.array:
             'state fewer numerics.cells, or numerics.solver = "single"'
         ) from error
     return found
+
+
+def filled(matrix: scipy.sparse.csr_array, device: wp.Device) -> wp.array:
+    """(k, k) float64 on a device of a sparse matrix; each entry is stored once. The host holds no dense copy."""
+    entries, full = matrix.tocoo(), wp.zeros(matrix.shape, dtype=wp.float64, device=device)
+    places = (wp.array(each, dtype=wp.int32, device=device) for each in (entries.row, entries.col))
+    values = wp.array(entries.data, dtype=wp.float64, device=device)
+    wp.launch(scatter, entries.nnz, inputs=[*places, values, full], device=device)
+    return full
+
+
+def unit_rows(count: int, length: int, first: int, device: wp.Device) -> wp.array:
+    """(count, length) float64 on a device: rows of the identity matrix, from a first one on."""
+    rows = wp.zeros((count, length), dtype=wp.float64, device=device)
+    rows.flatten()[first :: length + 1].fill_(1.0)
+    return rows
 
 
 def _invert_by_cusolver(factors: wp.array, found: wp.array) -> None:
@@ -187,17 +203,10 @@ def _invert_by_cusolver(factors: wp.array, found: wp.array) -> None:
             if info.numpy()[0]:
                 raise np.linalg.LinAlgError("Singular matrix")
             for first in range(0, n, COLUMNS):
-                columns = wp.array(np.eye(min(COLUMNS, n - first), n, first), dtype=wp.float64, device=device)
-                right = (
-                    ctypes.c_int64(len(columns)),
-                    FLOAT64,
-                    left,
-                    size,
-                    order,
-                    FLOAT64,
-                    ctypes.c_void_p(columns.ptr),
-                )
-                run("cusolverDnXgetrs", handle, settings, 0, size, *right, size, told)
+                columns = unit_rows(min(COLUMNS, n - first), n, first, device)
+                right, count = ctypes.c_void_p(columns.ptr), ctypes.c_int64(len(columns))
+                wanted = (size, count, FLOAT64, left, size, order, FLOAT64, right, size, told)
+                run("cusolverDnXgetrs", handle, settings, 0, *wanted)
                 wp.launch(round_rows, columns.shape, inputs=[columns, first, found], device=device)
             wp.synchronize_device(device)
         finally:

@@ -20,10 +20,9 @@ from functools import cache
 
 import warp as wp
 
-from synth.simulate.batched.lane_orders import GOAL, NORM, STICKING, Seen
+from synth.simulate.batched.lane_orders import Number, Order, Seen
 from synth.simulate.linear import GMRES_LIMIT
 
-SEEN_DONE, SEEN_FINITE = wp.constant(int(Seen.DONE)), wp.constant(int(Seen.FINITE))
 WAITING, RUNNING, DONE = wp.constant(0), wp.constant(1), wp.constant(2)
 LIMIT = wp.constant(GMRES_LIMIT)
 ZERO = wp.constant(wp.float32(0.0))
@@ -105,50 +104,34 @@ def padded(unknowns: int) -> int:
 
 
 @wp.kernel
-def begin_vectors(
+def begin_solves(
     mask: wp.array(dtype=wp.int32),
     numbers: wp.array2d(dtype=wp.float64),
     free: wp.array(dtype=wp.int32),
-    force: wp.array2d(dtype=wp.vec3d),
-    volume: wp.array2d(dtype=wp.float64),
+    residual: wp.array2d(dtype=wp.float64),
     krylov: Krylov,
 ):
-    """One thread per (lane, four rows): the first basis vector, minus the residual over its norm.
+    """One thread per (lane, four rows): iterations begin, with minus the residual over its norm as first basis vector.
 
-    free: (rows,) number of the unknown, displacements of all nodes first, or -1 for rows that fill up.
+    free: (rows,) number of the value in a residual (B, 3 n + k), or -1 for rows that fill up.
     """
     s, i = wp.tid()
     if mask[s] == 0:
         return
-    size = numbers[s, NORM]
-    moves = 3 * force.shape[1]
+    size = numbers[s, Number.NORM]
     found = wp.vec4f()
     for k in range(4):
         unknown = free[4 * i + k]
         if unknown >= 0 and size > wp.float64(0.0):
-            value = wp.float64(0.0)
-            if unknown < moves:
-                value = -force[s, unknown // 3][unknown % 3] / size
-            else:
-                value = -volume[s, unknown - moves] / size
-            found[k] = wp.float32(value)
+            found[k] = wp.float32(-residual[s, unknown] / size)
     krylov.basis[s, 0, i] = found
     krylov.current[s, i] = rounded_four(found)
-
-
-@wp.kernel
-def begin_solve(mask: wp.array(dtype=wp.int32), numbers: wp.array2d(dtype=wp.float64), krylov: Krylov):
-    """One thread per lane: where a right side and a matrix are ready, iterations begin."""
-    s = wp.tid()
-    if mask[s] == 0:
-        return
-    krylov.goal[s] = wp.float32(numbers[s, GOAL])
-    krylov.size[s] = numbers[s, NORM]
-    krylov.k[s] = 0
-    krylov.residual[s, 0] = ONE
-    krylov.running[s] = RUNNING
-    if numbers[s, NORM] == wp.float64(0.0):
-        krylov.running[s] = DONE
+    if i == 0:
+        krylov.goal[s] = wp.float32(numbers[s, Number.GOAL])
+        krylov.size[s] = size
+        krylov.k[s] = 0
+        krylov.residual[s, 0] = ONE
+        krylov.running[s] = wp.where(size == wp.float64(0.0), DONE, RUNNING)
 
 
 @cache
@@ -225,7 +208,7 @@ def solution(rows: int) -> wp.Kernel:
     def finish(krylov: Krylov, seen: wp.array2d(dtype=wp.float64)):
         s, thread = wp.tid()
         if thread == 0:
-            seen[s, SEEN_DONE] = wp.float64(0.0)
+            seen[s, Seen.DONE] = wp.float64(0.0)
         if krylov.running[s] != DONE:
             return
         k = krylov.k[s]
@@ -248,20 +231,31 @@ def solution(rows: int) -> wp.Kernel:
             wp.tile_axpy(weight, z, total)
         wp.tile_store(krylov.step[s], total * wp.float32(krylov.size[s]), bounds_check=False)
         if thread == 0:
-            seen[s, SEEN_DONE] = wp.float64(1.0)
-            seen[s, SEEN_FINITE] = wp.float64(finite)
+            seen[s, Seen.DONE] = wp.float64(1.0)
+            seen[s, Seen.FINITE] = wp.float64(finite)
 
     return finish
 
 
 @wp.kernel
-def release(krylov: Krylov, orders: wp.array(dtype=wp.int32), found: wp.array(dtype=wp.int32)):
-    """One thread per lane: a solution leaves the lane waiting; its whole step is tried unless it is a predictor's."""
+def release(
+    krylov: Krylov,
+    orders: wp.array(dtype=wp.int32),
+    numbers: wp.array2d(dtype=wp.float64),
+    share: wp.array(dtype=wp.float64),
+    mask: wp.array(dtype=wp.int32),
+):
+    """One thread per lane: whether it is evaluated, and at which share of the step from the iterate.
+
+    A solution leaves the lane waiting, and its whole step is tried.
+    """
     s = wp.tid()
-    found[s] = 0
+    mask[s] = wp.where((orders[s] & (Order.EVALUATE | Order.TRY)) != 0, 1, 0)
+    share[s] = wp.where((orders[s] & Order.TRY) != 0, numbers[s, Number.SHARE], wp.float64(0.0))
     if krylov.running[s] == DONE:
         krylov.running[s] = WAITING
-        found[s] = wp.where((orders[s] & STICKING) != 0, 0, 1)
+        mask[s] = 1
+        share[s] = wp.float64(1.0)
 
 
 HALF, KEPT = wp.constant(wp.uint32(0x1000)), wp.constant(wp.uint32(0xFFFFE000))
@@ -286,3 +280,15 @@ def round_rows(rows: wp.array2d(dtype=wp.float64), first: int, matrix: wp.array2
     """Rows of a matrix, from a first one on; one thread per number."""
     i, j = wp.tid()
     matrix[first + i, j] = rounded(wp.float32(rows[i, j]))
+
+
+@wp.kernel
+def scatter(
+    row: wp.array(dtype=wp.int32),
+    column: wp.array(dtype=wp.int32),
+    value: wp.array(dtype=wp.float64),
+    matrix: wp.array2d(dtype=wp.float64),
+):
+    """The entries of a sparse matrix in a dense one; one thread per entry that is stored."""
+    i = wp.tid()
+    matrix[row[i], column[i]] = value[i]

@@ -3,49 +3,37 @@
 from collections.abc import Generator
 from typing import Any
 
+import numpy as np
+
 from synth.arrays import FloatArray
+from synth.press.press import Press
 from synth.simulate.batched.lane_orders import PATH_DERIVATIVE_STEP, Number, Order, Seen
 from synth.simulate.linear import GMRES_TOLERANCE
 from synth.simulate.policy import requests as ask
 from synth.simulate.policy.load_steps import LoadSteps
 
 REDUCTION_FACTOR, SAFETY_FACTOR = 0.9, 0.3
-UNANSWERED = {
-    ask.Do.TAKE: int(Order.TAKE),
-    ask.Do.KEEP_STEP: int(Order.KEEP_STEP),
-    ask.Do.RESTORE_STEP: int(Order.RESTORE_STEP),
-    ask.Do.KEEP_PASS: int(Order.KEEP_PASS),
-    ask.Do.ANCHOR: int(Order.ANCHOR),
-    ask.Do.ACCEPT: int(Order.ACCEPT),
-}
-AT, RATIO, SHARE, VISCOSITY, STIFFENING, NORM, GOAL, RECORD = map(int, Number)
-FREE, FORCE, DONE, FINITE = int(Seen.FREE), int(Seen.FORCE), int(Seen.DONE), int(Seen.FINITE)
-EVALUATE, TRY, SOLVE, BEGIN, PREDICT, STICKING = (
-    int(order) for order in (Order.EVALUATE, Order.TRY, Order.SOLVE, Order.BEGIN, Order.PREDICT, Order.STICKING)
-)
-RESTORE_PASS, REPEAT, AUGMENT, FORCE_ORDER, RECORD_ORDER = (
-    int(order) for order in (Order.RESTORE_PASS, Order.REPEAT, Order.AUGMENT, Order.FORCE, Order.RECORD)
-)
+ORDERS: dict[ask.Do, int] = {do: getattr(Order, do.name) for do in ask.Do}
 Row = list[float]
 """What a lane has seen in a cycle, by the columns of `Seen`."""
 
 
 def _evaluation(seen: Row) -> ask.Evaluation:
-    return ask.Evaluation(*seen[:FORCE])
+    return ask.Evaluation(*seen[: Seen.DONE])
 
 
 class Lane:
     """A press in a lane.
 
     Attributes:
-        press: its number.
+        number, press: the press and its number.
         records: what it has recorded; the fields are on the device.
         ended: whether the present orders are the last; reason: why the press ended early, or nothing.
     """
 
-    def __init__(self, press: int, steps: LoadSteps, numbers: FloatArray, forcing: float) -> None:
+    def __init__(self, number: int, press: Press, steps: LoadSteps, numbers: FloatArray, forcing: float) -> None:
         """numbers: (k,) the lane's, by the columns of `Number`; written to in place."""
-        self.press, self.records = press, list[ask.Record]()
+        self.number, self.press, self.records = number, press, list[ask.Record]()
         self.ended, self.reason = False, ""
         self._steps, self._numbers, self._forcing = steps, numbers, forcing
         self._orders = self._translated()
@@ -56,9 +44,11 @@ class Lane:
     def _translated(self) -> Generator[int, Row, None]:
         policy, numbers = self._steps.run(), self._numbers
         answer: Any = None
-        order, at, target, stiffening, size = 0, 0.0, 0.0, 1.0, 1.0
-        numbers[STIFFENING] = 1.0
-        iterate = trial = _evaluation([0.0] * len(Seen))
+        order, at, target, size = 0, 0.0, 0.0, 1.0
+        own = before_pass = numbers[Number.STIFFNESS] = (
+            self.press.scene.numerics.penalty * self.press.path.body.sharpness
+        )
+        iterate = trial = _evaluation([0.0] * Seen.DONE)
         is_stale = False  # whether the last evaluation was of a trial that was not taken
         while True:
             try:
@@ -67,69 +57,66 @@ class Lane:
                 self.ended, self.reason = True, end.value
                 yield order
                 return
-            answer = None
+            answer, changes = None, False  # whether the iterate changes, so that it must be evaluated
             kind = type(request)
             if kind is ask.Do:
-                if request in UNANSWERED:
-                    order |= UNANSWERED[request]
-                    if request is ask.Do.TAKE:
-                        iterate, is_stale = trial, False
-                    elif request is ask.Do.ACCEPT:
-                        at = target
-                    elif request is ask.Do.KEEP_PASS:
-                        stiffening = numbers[STIFFENING]
-                    elif request is ask.Do.RESTORE_STEP:
-                        numbers[STIFFENING] = 1.0
+                order |= ORDERS[request]
+                if request is ask.Do.TAKE:
+                    iterate, is_stale = trial, False
+                elif request is ask.Do.ACCEPT:
+                    at = target
+                elif request is ask.Do.KEEP_PASS:
+                    before_pass = numbers[Number.STIFFNESS]
+                elif request is ask.Do.RESTORE_STEP:
+                    numbers[Number.STIFFNESS] = own
                 elif request is ask.Do.FORCE:
-                    answer, order = (yield order | FORCE_ORDER)[FORCE], 0
-                else:
-                    if request is ask.Do.RESTORE_PASS:
-                        numbers[STIFFENING] = stiffening
-                        order |= RESTORE_PASS
-                    else:
-                        order |= REPEAT
-                    answer = iterate = _evaluation((yield order | EVALUATE))
-                    order, is_stale = 0, False
+                    answer = float(np.dot((yield order)[Seen.FORCE : Seen.FORCE + 3], self.press.path.direction))
+                    order = 0
+                elif request is ask.Do.REPEAT:
+                    changes = True
+                elif request is ask.Do.RESTORE_PASS:
+                    numbers[Number.STIFFNESS], changes = before_pass, True
             elif kind is ask.Try:
                 if request.share < 1:
-                    numbers[SHARE] = request.share
-                    trial = _evaluation((yield order | TRY))
+                    numbers[Number.SHARE] = request.share
+                    trial = _evaluation((yield order | Order.TRY))
                 answer, order, is_stale = trial, 0, True
             elif kind is ask.Solve:
                 if is_stale:
-                    iterate = _evaluation((yield order | EVALUATE))
+                    iterate = _evaluation((yield order | Order.EVALUATE))
                     order, is_stale = 0, False
-                numbers[NORM], numbers[VISCOSITY] = iterate.free, request.viscosity or 0.0
-                numbers[GOAL] = self._goal(request, iterate.free / size)
+                numbers[Number.NORM], numbers[Number.VISCOSITY] = iterate.free, request.viscosity or 0.0
+                numbers[Number.GOAL] = self._goal(request, iterate.free / size)
                 size = iterate.free
-                seen = yield order | SOLVE
-                while not seen[DONE]:
+                seen = yield order | Order.SOLVE
+                while not seen[Seen.DONE]:
                     seen = yield 0
-                answer, order, trial, is_stale = seen[FINITE] == 1, 0, _evaluation(seen), True
+                answer, order, trial, is_stale = seen[Seen.FINITE] == 1, 0, _evaluation(seen), True
             elif kind is ask.Begin:
-                target = request.at_mm
-                numbers[RATIO] = request.ratio
-                start = BEGIN
+                target, changes = request.at_mm, True
+                numbers[Number.RATIO] = request.ratio
+                start = Order.BEGIN
                 if request.rigid:
-                    numbers[AT] = at + PATH_DERIVATIVE_STEP * (target - at)
-                    seen = yield order | BEGIN | STICKING | EVALUATE
-                    numbers[AT], numbers[VISCOSITY], numbers[NORM] = at, 0.0, seen[FREE]
-                    numbers[GOAL] = min(GMRES_TOLERANCE, self._forcing)
-                    seen = yield SOLVE | STICKING
-                    while not seen[DONE]:
-                        seen = yield STICKING
-                    order, start = 0, PREDICT if seen[FINITE] else BEGIN
-                numbers[AT] = target
-                answer = iterate = _evaluation((yield order | start | EVALUATE))
-                order, is_stale = 0, False
+                    numbers[Number.AT] = at + PATH_DERIVATIVE_STEP * (target - at)
+                    seen = yield order | Order.BEGIN | Order.STICKING | Order.EVALUATE
+                    numbers[Number.AT], numbers[Number.VISCOSITY], numbers[Number.NORM] = at, 0.0, seen[Seen.FREE]
+                    numbers[Number.GOAL] = min(GMRES_TOLERANCE, self._forcing)
+                    seen = yield Order.SOLVE | Order.STICKING
+                    while not seen[Seen.DONE]:
+                        seen = yield Order.STICKING
+                    order, start = 0, Order.PREDICT if seen[Seen.FINITE] else Order.BEGIN
+                numbers[Number.AT] = target
+                order |= start
             elif kind is ask.Augment:
-                numbers[SHARE], numbers[STIFFENING] = request.share, request.stiffening
-                answer = iterate = _evaluation((yield order | AUGMENT | EVALUATE))
-                order, is_stale = 0, False
+                numbers[Number.SHARE], numbers[Number.STIFFNESS] = request.share, request.stiffening * own
+                order, changes = order | Order.AUGMENT, True
             else:
-                numbers[RECORD] = len(self.records)
+                numbers[Number.RECORD] = len(self.records)
                 self.records.append(request)
-                order |= RECORD_ORDER
+                order |= Order.RECORD
+            if changes:
+                answer = iterate = _evaluation((yield order | Order.EVALUATE))
+                order, is_stale = 0, False
 
     def _goal(self, wanted: ask.Solve, fallen: float) -> float:
         """The second choice of Eisenstat & Walker (SIAM J. Sci. Comput. 17, 1996), no more than Newton's method needs.

@@ -5,7 +5,7 @@ policies of all lanes want of a cycle is gathered into one set of bits and one r
 is launched once for all lanes that want the same. The order in which a cycle does what it is told is that of the bits.
 """
 
-from enum import IntEnum, IntFlag
+from enum import IntEnum
 
 import warp as wp
 
@@ -13,8 +13,11 @@ from synth.simulate.contact_friction import Indenters
 from synth.simulate.policy import requests
 
 
-class Order(IntFlag):
-    """What a lane is to do in a cycle, in this order; see `synth.simulate.policy.requests`."""
+class Order:
+    """What a lane is to do in a cycle, in this order; see `synth.simulate.policy.requests`.
+
+    Integers, since Python takes long to combine flags of an Enum.
+    """
 
     TAKE = 1 << 0
     RESTORE_PASS = 1 << 1  # the iterate and its multipliers
@@ -38,18 +41,16 @@ class Order(IntFlag):
 class Number(IntEnum):
     """Columns of the numbers that go with orders."""
 
-    AT, RATIO, SHARE, VISCOSITY, STIFFENING, NORM, GOAL, RECORD = range(8)
+    AT, RATIO, SHARE, VISCOSITY, STIFFNESS, NORM, GOAL, RECORD = range(8)
 
 
 class Seen(IntEnum):
-    """Columns of what a lane answers with: the parts of an Evaluation, and of a linear solve."""
+    """Columns of what a lane answers with: an Evaluation, a linear solve, and from FORCE on sums over what touches.
 
-    FREE, FORCES, REACTION, JACOBIAN, DEEPEST, MOVED, ERROR, FORCE, DONE, FINITE = range(10)
+    Those are force (3), moment (3), touching and slipping area.
+    """
 
-
-AT, RATIO, SHARE, VISCOSITY, STIFFENING, NORM, GOAL, RECORD = (wp.constant(int(n)) for n in Number)
-STICKING, AUGMENT = wp.constant(int(Order.STICKING)), wp.constant(int(Order.AUGMENT))
-EVALUATED = wp.constant(int(Order.EVALUATE | Order.TRY))
+    FREE, FORCES, REACTION, JACOBIAN, DEEPEST, MOVED, ERROR, DONE, FINITE, FORCE = range(10)
 
 
 @wp.struct
@@ -57,23 +58,20 @@ class Presses:
     """The load path and body of each lane's press, (B, ...).
 
     Attributes:
-        corners, ends, legs: `LoadPath.corners` (B, K, 4), `LoadPath.ends` (B, K) and their number, 0 before
-            the lane's first press.
+        corners, ends: `LoadPath.corners` (B, K, 4) and `LoadPath.ends` (B, K), infinite behind the last corner.
         origin, axes: of `LoadPath.frame`; zeros and the identity for flat pads and domes.
         position, rotation: of the body, as `LoadPath.pose` uses them; reach: the body's less the face's z, mm.
-        friction: as `synth.simulate.contact_friction.Indenters`; sharpness: times the contact stiffness, E per mm.
+        friction: as `synth.simulate.contact_friction.Indenters`.
     """
 
     corners: wp.array2d(dtype=wp.vec4d)
     ends: wp.array2d(dtype=wp.float64)
-    legs: wp.array(dtype=wp.int32)
     origin: wp.array(dtype=wp.vec3d)
     axes: wp.array(dtype=wp.mat33d)
     position: wp.array(dtype=wp.vec2d)
     reach: wp.array(dtype=wp.float64)
     rotation: wp.array(dtype=wp.mat33d)
     friction: wp.array(dtype=wp.float64)
-    sharpness: wp.array(dtype=wp.float64)
 
 
 @wp.kernel
@@ -83,28 +81,6 @@ def select(orders: wp.array(dtype=wp.int32), wanted: int, mask: wp.array(dtype=w
     mask[s] = wp.where((orders[s] & wanted) != 0, 1, 0)
 
 
-@wp.kernel
-def select_evaluated(orders: wp.array(dtype=wp.int32), found: wp.array(dtype=wp.int32), mask: wp.array(dtype=wp.int32)):
-    """1 for lanes that are to be evaluated or tried, or whose direction was found in this cycle."""
-    s = wp.tid()
-    mask[s] = wp.where((orders[s] & EVALUATED) != 0 or found[s] == 1, 1, 0)
-
-
-@wp.kernel
-def augmented_shares(
-    orders: wp.array(dtype=wp.int32), numbers: wp.array2d(dtype=wp.float64), shares: wp.array(dtype=wp.float64)
-):
-    """(B,) share of the update of multipliers, 0 where there is none."""
-    s = wp.tid()
-    shares[s] = wp.where((orders[s] & AUGMENT) != 0, numbers[s, SHARE], wp.float64(0.0))
-
-
-@wp.kernel
-def viscosities(numbers: wp.array2d(dtype=wp.float64), viscosity: wp.array(dtype=wp.float64)):
-    s = wp.tid()
-    viscosity[s] = numbers[s, VISCOSITY]
-
-
 STICK_FRICTION = wp.constant(wp.float64(requests.STICK_FRICTION))
 PATH_DERIVATIVE_STEP = requests.PATH_DERIVATIVE_STEP
 
@@ -112,24 +88,12 @@ PATH_DERIVATIVE_STEP = requests.PATH_DERIVATIVE_STEP
 @wp.func
 def _corner(presses: Presses, j: int, s: wp.float64) -> wp.vec4d:
     """Depth, shear and twist at path length s, as `numpy.interp` finds them."""
-    last = presses.legs[j] - 1
-    if s <= presses.ends[j, 0]:
-        return presses.corners[j, 0]
-    if s >= presses.ends[j, last]:
-        return presses.corners[j, last]
     k = wp.int32(0)
     while presses.ends[j, k + 1] <= s:
         k += 1
     a = presses.corners[j, k]
     b = presses.corners[j, k + 1]
     return (s - presses.ends[j, k]) / (presses.ends[j, k + 1] - presses.ends[j, k]) * (b - a) + a
-
-
-@wp.kernel
-def set_stiffness(numbers: wp.array2d(dtype=wp.float64), presses: Presses, indenters: Indenters):
-    """The contact stiffness, so many times the body's own."""
-    s = wp.tid()
-    indenters.sharpness[s] = numbers[s, STIFFENING] * presses.sharpness[s]
 
 
 @wp.kernel
@@ -141,9 +105,7 @@ def place_indenters(
 ):
     """Each lane's indenter where it is to be, and its friction."""
     i = wp.tid()
-    if presses.legs[i] == 0:
-        return
-    pose = _corner(presses, i, numbers[i, AT])
+    pose = _corner(presses, i, numbers[i, Number.AT])
     place = presses.position[i]
     local = wp.vec3d(place[0] + pose[1], place[1] + pose[2], pose[0] - presses.reach[i])
     indenters.centre[i] = presses.origin[i] + presses.axes[i] * local
@@ -154,5 +116,5 @@ def place_indenters(
     turn = wp.mat33d(c, -n, zero, n, c, zero, zero, zero, wp.float64(1.0))
     indenters.rotation[i] = presses.axes[i] * (turn * presses.rotation[i])
     indenters.friction[i] = presses.friction[i]
-    if (orders[i] & STICKING) != 0:
+    if (orders[i] & Order.STICKING) != 0:
         indenters.friction[i] = STICK_FRICTION

@@ -25,31 +25,31 @@ class PressTable:
         self._device = device
         self.kind, self.shape = np.zeros(batch, dtype=np.int32), np.zeros((batch, SHAPE_LENGTH))
         widths: dict[str, tuple[int, ...]] = {
-            "corners": (1, 4), "ends": (1,), "origin": (3,), "axes": (3, 3), "position": (2,), "reach": (),
-            "rotation": (3, 3), "friction": (), "sharpness": (),
+            "corners": (2, 4), "ends": (2,), "origin": (3,), "axes": (3, 3), "position": (2,), "reach": (),
+            "rotation": (3, 3), "friction": (),
         }  # fmt: skip
         self._columns: dict[str, np.ndarray] = {name: np.zeros((batch, *width)) for name, width in widths.items()}
-        self._columns["legs"] = np.zeros(batch, dtype=np.int32)
+        self._columns["ends"][:, 1] = np.inf
 
     def put(self, lane: int, press: Press) -> None:
         """A press begins in a lane."""
         columns, path = self._columns, press.path
-        body, legs = path.body, len(path.ends)
+        body, corners = path.body, len(path.ends)
         self.kind[lane], self.shape[lane] = body.kind, body.shape
-        for name, values in (("corners", path.corners), ("ends", path.ends)):
-            column = columns[name]
-            if column.shape[1] < len(values):
-                columns[name] = column = padded(column, (len(column), len(values), *column.shape[2:]))
-            column[lane, : len(values)] = values
+        for name, values, behind in (("corners", path.corners, 0.0), ("ends", path.ends, np.inf)):
+            more = corners + 1 - columns[name].shape[1]
+            if more > 0:
+                widths = [(0, 0), (0, more), (0, 0)][: columns[name].ndim]
+                columns[name] = np.pad(columns[name], widths, constant_values=behind)
+            columns[name][lane] = behind
+            columns[name][lane, :corners] = values
         row = {
-            "legs": legs,
             "origin": np.zeros(3) if path.frame is None else path.frame.origin,
             "axes": np.eye(3) if path.frame is None else path.frame.axes,
             "position": path.motion.position_mm,
             "reach": body.reach_mm - path.face_mm,
             "rotation": body.rotation,
             "friction": press.scene.contact.friction,
-            "sharpness": press.scene.numerics.penalty * body.sharpness,
         }
         for name, value in row.items():
             columns[name][lane] = value
@@ -80,22 +80,10 @@ def trajectory(
 
 
 def _state(press: Press, told: Record, row: FloatArray, space: Space) -> State:
-    pose, modulus_mpa = press.path.pose(told.at_mm), press.scene.sensor.gel.youngs_modulus_kpa / 1000
-    scalars, fields = row[:SCALARS].tolist(), row[SCALARS:]
-    end = 3 * len(space.points)
-    fx, fy, fz, mx, my, mz = (modulus_mpa * value for value in scalars[:6])
-    touching, slipping = scalars[6:]
-    return State(
-        depth_mm=pose.depth_mm,
-        shear_mm=pose.shear_mm,
-        twist_deg=pose.twist_deg,
-        displacement=fields[:end].reshape(-1, 3).copy(),
-        traction=modulus_mpa * fields[end:].reshape(-1, 3),
-        force_n=(fx, fy, fz),
-        torque_nmm=(mx, my, mz),
-        newton_iterations=told.iterations,
-        residual=told.evaluation.relative,
-        min_jacobian=told.evaluation.smallest_jacobian,
-        max_penetration_mm=told.evaluation.deepest_mm,
-        slip_ratio=slipping / touching if touching > 0 else 0.0,
-    )
+    end = SCALARS + 3 * len(space.points)
+    loads = row[:3], row[3:6], row[end:].reshape(-1, 3)
+    touching, slipping = row[6:SCALARS].tolist()
+    ratio = slipping / touching if touching > 0 else 0.0
+    modulus_mpa = press.scene.sensor.gel.youngs_modulus_kpa / 1000
+    displacement = row[SCALARS:end].reshape(-1, 3).copy()
+    return State.of(told, press.path.pose(told.at_mm), displacement, loads, modulus_mpa, ratio)

@@ -42,16 +42,22 @@ STORED_YEOH = 26
 
 @wp.struct
 class SingleTables:
-    """Tables of the elements in single precision, and where their nodes are in a vector.
+    """Tables of elements and faces in single precision, and where unknowns are in a vector.
 
     Attributes:
-        row: (m, nn) first row of a node's displacement, -1 where it is held.
-        pressure_row: (m, 4).
+        unknown: (rows,) number of a row's unknown, displacements of all nodes first; -1 where there is none.
+        row: (3 n + k,) the other way round; -1 where the unknown is held.
+        element_row, face_row: (m, nn), (f, ns) first rows of the displacements of their nodes; pressure_row: (m, 4).
+        face_shape: (nq, ns).
         gradient, pressure_shape, stabilisation: as in `synth.simulate.bulk.Bulk`.
     """
 
-    row: wp.array2d(dtype=wp.int32)
+    unknown: wp.array(dtype=wp.int32)
+    row: wp.array(dtype=wp.int32)
+    element_row: wp.array2d(dtype=wp.int32)
+    face_row: wp.array2d(dtype=wp.int32)
     pressure_row: wp.array2d(dtype=wp.int32)
+    face_shape: wp.array2d(dtype=wp.float32)
     gradient: wp.array3d(dtype=wp.vec3f)
     pressure_shape: wp.array2d(dtype=wp.float32)
     stabilisation: wp.array3d(dtype=wp.float32)
@@ -123,7 +129,7 @@ def bulk_product(nodes: int, mixed: bool, stabilised: bool, yeoh: bool) -> wp.Ke
         v = nodal()
         r = nodal()
         for a in range(count):
-            row = single.row[e, a]
+            row = single.element_row[e, a]
             if row >= 0:
                 v[a, 0] = x[row, s]
                 v[a, 1] = x[row + 1, s]
@@ -174,7 +180,7 @@ def bulk_product(nodes: int, mixed: bool, stabilised: bool, yeoh: bool) -> wp.Ke
                 r[a, 1] += t[1]
                 r[a, 2] += t[2]
         for a in range(count):
-            row = single.row[e, a]
+            row = single.element_row[e, a]
             if row >= 0:
                 wp.atomic_add(y, row, s, r[a, 0])
                 wp.atomic_add(y, row + 1, s, r[a, 1])
@@ -197,14 +203,10 @@ def store_contact(
     symmetric: wp.array3d(dtype=wp.mat33d),
     remainder: wp.array3d(dtype=wp.mat33d),
     stored: wp.array3d(dtype=wp.mat33f),
-    touched: wp.array2d(dtype=wp.int32),
 ):
     """One thread per (lane, face): w times the whole of -∂t/∂x at its points, where it touches."""
     s, f = wp.tid()
-    if mask[s] == 0:
-        return
-    touched[s, f] = touching[s, f]
-    if touching[s, f] == 0:
+    if mask[s] == 0 or touching[s, f] == 0:
         return
     for q in range(weight.shape[1]):
         stored[s, f, q] = wp.mat33f(weight[f, q] * (symmetric[s, f, q] + remainder[s, f, q]))
@@ -219,35 +221,34 @@ def contact_product(nodes: int) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def product(
         running: wp.array(dtype=wp.int32),
-        touched: wp.array2d(dtype=wp.int32),
-        row: wp.array2d(dtype=wp.int32),
-        shape: wp.array2d(dtype=wp.float32),
+        touching: wp.array2d(dtype=wp.int32),
+        single: SingleTables,
         stored: wp.array3d(dtype=wp.mat33f),
         x: wp.array2d(dtype=wp.float32),
         y: wp.array2d(dtype=wp.float32),
     ):
         s, f = wp.tid()
-        if running[s] != RUNNING or touched[s, f] == 0:
+        if running[s] != RUNNING or touching[s, f] == 0:
             return
         v = nodal()
         r = nodal()
         for a in range(count):
-            first = row[f, a]
+            first = single.face_row[f, a]
             if first >= 0:
                 v[a, 0] = x[first, s]
                 v[a, 1] = x[first + 1, s]
                 v[a, 2] = x[first + 2, s]
-        for q in range(shape.shape[0]):
+        for q in range(single.face_shape.shape[0]):
             here = wp.vec3f()
             for a in range(count):
-                here += shape[q, a] * wp.vec3f(v[a, 0], v[a, 1], v[a, 2])
+                here += single.face_shape[q, a] * wp.vec3f(v[a, 0], v[a, 1], v[a, 2])
             t = stored[s, f, q] * here
             for a in range(count):
-                r[a, 0] += shape[q, a] * t[0]
-                r[a, 1] += shape[q, a] * t[1]
-                r[a, 2] += shape[q, a] * t[2]
+                r[a, 0] += single.face_shape[q, a] * t[0]
+                r[a, 1] += single.face_shape[q, a] * t[1]
+                r[a, 2] += single.face_shape[q, a] * t[2]
         for a in range(count):
-            first = row[f, a]
+            first = single.face_row[f, a]
             if first >= 0:
                 wp.atomic_add(y, first, s, r[a, 0])
                 wp.atomic_add(y, first + 1, s, r[a, 1])
@@ -282,7 +283,7 @@ def barrier_product(
     inverting: wp.array2d(dtype=wp.int32),
     u: wp.array2d(dtype=wp.vec3d),
     barrier: BarrierTables,
-    row: wp.array2d(dtype=wp.int32),
+    single: SingleTables,
     x: wp.array2d(dtype=wp.float32),
     y: wp.array2d(dtype=wp.float32),
 ):
@@ -298,7 +299,7 @@ def barrier_product(
         if J < ONSET_JACOBIAN:
             G = wp.mat33d()
             for a in range(10):
-                first = row[e, a]
+                first = single.element_row[e, a]
                 if first >= 0:
                     v = wp.vec3d(wp.float64(x[first, s]), wp.float64(x[first + 1, s]), wp.float64(x[first + 2, s]))
                     G += wp.outer(v, shape_gradient(barrier, at, e, a))
@@ -306,7 +307,7 @@ def barrier_product(
             Fit = wp.transpose(wp.inverse(F))
             S = (wp.float64(2.0) * t * wp.ddot(Fit, G)) * Fit + (t * t) * (Fit * wp.transpose(G) * Fit)
             for a in range(10):
-                first = row[e, a]
+                first = single.element_row[e, a]
                 if first >= 0:
                     pull = barrier.weight[e] * (S * shape_gradient(barrier, at, e, a))
                     for i in range(3):

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from synth.simulate.batched.fields import Fields, node_step
-from synth.simulate.batched.lane_orders import NORM, RECORD, SHARE, Order, Seen
+from synth.simulate.batched.fields import Fields, node_value
+from synth.simulate.batched.lane_orders import Number, Seen
 from synth.simulate.contact_friction import Faces, Indenters, position
 
 BLOCK = 256
@@ -12,8 +12,6 @@ SLIPS = wp.constant(wp.float64(1.0 - 1.0e-6))
 """Share of the friction limit from which a point counts as slipping, as in `System.slip_ratio`."""
 SCALARS = wp.constant(8)
 """A record's numbers before its fields: force (3), moment (3), touching and slipping area."""
-FREE, FORCES, REACTION, JACOBIAN, DEEPEST, MOVED, ERROR, FORCE, DONE, FINITE = (wp.constant(int(n)) for n in Seen)
-TRY = wp.constant(int(Order.TRY))
 
 
 @wp.struct
@@ -28,14 +26,18 @@ class SurfaceTables:
 @wp.kernel
 def residual_norms(
     mask: wp.array(dtype=wp.int32),
-    force: wp.array2d(dtype=wp.vec3d),
-    volume: wp.array2d(dtype=wp.float64),
+    residual: wp.array2d(dtype=wp.float64),
+    nodes: int,
     jacobian: wp.array2d(dtype=wp.float64),
-    node_row: wp.array(dtype=wp.int32),
+    gap: wp.array2d(dtype=wp.float64),
+    row: wp.array(dtype=wp.int32),
     fields: Fields,
     seen: wp.array2d(dtype=wp.float64),
 ):
-    """One block per lane: norms of the free residual, all forces and those on held nodes, smallest det F, moved."""
+    """One block per lane: what an Evaluation holds but for the error, see `synth.simulate.policy.requests`.
+
+    gap: (B, points); row: of each value in Krylov vectors, -1 where it is held.
+    """
     s, thread = wp.tid()
     if mask[s] == 0:
         return
@@ -44,42 +46,46 @@ def residual_norms(
     held = wp.float64(0.0)
     smallest = wp.float64(1.0e30)
     farthest = wp.float64(0.0)
-    for i in range(thread, force.shape[1], wp.block_dim()):
-        farthest = wp.max(farthest, wp.length_sq(fields.trial_u[s, i] - fields.before_pass_u[s, i]))
-        square = wp.length_sq(force[s, i])
+    deepest = wp.float64(0.0)
+    for i in range(thread, nodes, wp.block_dim()):
+        moved = node_value(fields.trial, s, i) - node_value(fields.before_pass, s, i)
+        farthest = wp.max(farthest, wp.length_sq(moved))
+        square = wp.length_sq(node_value(residual, s, i))
         whole += square
-        if node_row[i] >= 0:
+        if row[3 * i] >= 0:
             free += square
         else:
             held += square
-    for i in range(thread, volume.shape[1], wp.block_dim()):
-        free += volume[s, i] * volume[s, i]
+    for i in range(3 * nodes + thread, residual.shape[1], wp.block_dim()):
+        free += residual[s, i] * residual[s, i]
     for i in range(thread, jacobian.shape[1], wp.block_dim()):
         smallest = wp.min(smallest, jacobian[s, i])
+    for i in range(thread, gap.shape[1], wp.block_dim()):
+        deepest = wp.max(deepest, -gap[s, i])
     free = wp.tile_extract(wp.tile_sum(wp.tile(free)), 0)
     whole = wp.tile_extract(wp.tile_sum(wp.tile(whole)), 0)
     smallest = wp.tile_extract(wp.tile_min(wp.tile(smallest)), 0)
     farthest = wp.tile_extract(wp.tile_max(wp.tile(farthest)), 0)
     held = wp.tile_extract(wp.tile_sum(wp.tile(held)), 0)
+    deepest = wp.tile_extract(wp.tile_max(wp.tile(deepest)), 0)
     if thread == 0:
-        seen[s, FREE] = wp.sqrt(free)
-        seen[s, FORCES] = wp.sqrt(whole)
-        seen[s, REACTION] = wp.sqrt(held)
-        seen[s, JACOBIAN] = smallest
-        seen[s, MOVED] = wp.sqrt(farthest)
-        seen[s, DEEPEST] = wp.float64(0.0)
+        seen[s, Seen.FREE] = wp.sqrt(free)
+        seen[s, Seen.FORCES] = wp.sqrt(whole)
+        seen[s, Seen.REACTION] = wp.sqrt(held)
+        seen[s, Seen.JACOBIAN] = smallest
+        seen[s, Seen.MOVED] = wp.sqrt(farthest)
+        seen[s, Seen.DEEPEST] = deepest
 
 
 @wp.kernel
 def relaxation_errors(
     mask: wp.array(dtype=wp.int32),
-    force: wp.array2d(dtype=wp.vec3d),
-    viscous: wp.array2d(dtype=wp.vec3d),
-    volume: wp.array2d(dtype=wp.float64),
-    node_row: wp.array(dtype=wp.int32),
-    pressure_row: wp.array(dtype=wp.int32),
+    residual: wp.array2d(dtype=wp.float64),
+    nodes: int,
+    viscous: wp.array2d(dtype=wp.float64),
+    row: wp.array(dtype=wp.int32),
     right: wp.array2d(dtype=wp.float32),
-    orders: wp.array(dtype=wp.int32),
+    share: wp.array(dtype=wp.float64),
     numbers: wp.array2d(dtype=wp.float64),
     seen: wp.array2d(dtype=wp.float64),
 ):
@@ -90,42 +96,19 @@ def relaxation_errors(
     s, thread = wp.tid()
     if mask[s] == 0:
         return
-    part = wp.float64(1.0)
-    if (orders[s] & TRY) != 0:
-        part = numbers[s, SHARE]
-    left = (wp.float64(1.0) - part) * numbers[s, NORM]
+    left = (wp.float64(1.0) - share[s]) * numbers[s, Number.NORM]
     total = wp.float64(0.0)
-    for i in range(thread, force.shape[1], wp.block_dim()):
-        row = node_row[i]
-        if row >= 0:
-            total += wp.length_sq(force[s, i] + viscous[s, i] + left * node_step(right, s, row))
-    for i in range(thread, volume.shape[1], wp.block_dim()):
-        rest = volume[s, i] + left * wp.float64(right[s, pressure_row[i]])
+    for i in range(thread, nodes, wp.block_dim()):
+        first = row[3 * i]
+        if first >= 0:
+            before = wp.vec3d(wp.vec3f(right[s, first], right[s, first + 1], right[s, first + 2]))
+            total += wp.length_sq(node_value(residual, s, i) + node_value(viscous, s, i) + left * before)
+    for i in range(3 * nodes + thread, residual.shape[1], wp.block_dim()):
+        rest = residual[s, i] + left * wp.float64(right[s, row[i]])
         total += rest * rest
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
     if thread == 0:
-        seen[s, ERROR] = wp.sqrt(total) / numbers[s, NORM]
-
-
-@wp.kernel
-def clear_sums(mask: wp.array(dtype=wp.int32), values: wp.array2d(dtype=wp.float64)):
-    """One thread per (lane, number): zeros for the sums."""
-    s, i = wp.tid()
-    if mask[s] == 1:
-        values[s, i] = wp.float64(0.0)
-
-
-@wp.kernel
-def penetrations(mask: wp.array(dtype=wp.int32), gap: wp.array3d(dtype=wp.float64), seen: wp.array2d(dtype=wp.float64)):
-    """One thread per (lane, face): the largest penetration."""
-    s, f = wp.tid()
-    if mask[s] == 0:
-        return
-    deepest = wp.float64(0.0)
-    for q in range(gap.shape[2]):
-        deepest = wp.max(deepest, -gap[s, f, q])
-    if deepest > wp.float64(0.0):
-        wp.atomic_max(seen, s, DEEPEST, deepest)
+        seen[s, Seen.ERROR] = wp.sqrt(total) / numbers[s, Number.NORM]
 
 
 @wp.kernel
@@ -170,29 +153,15 @@ def contact_forces(
 
 
 @wp.kernel
-def press_forces(
-    mask: wp.array(dtype=wp.int32),
-    axes: wp.array(dtype=wp.mat33d),
-    sums: wp.array2d(dtype=wp.float64),
-    seen: wp.array2d(dtype=wp.float64),
-):
-    """The indenter's force along the press."""
-    s = wp.tid()
-    if mask[s] == 1:
-        a = axes[s]
-        seen[s, FORCE] = sums[s, 0] * a[0, 2] + sums[s, 1] * a[1, 2] + sums[s, 2] * a[2, 2]
-
-
-@wp.kernel
 def write_record(
     mask: wp.array(dtype=wp.int32),
     numbers: wp.array2d(dtype=wp.float64),
-    u: wp.array2d(dtype=wp.vec3d),
+    iterate: wp.array2d(dtype=wp.float64),
+    nodes: int,
     sums: wp.array2d(dtype=wp.float64),
-    surface: int,
     records: wp.array3d(dtype=wp.float64),
 ):
-    """One thread per (lane, node): a record's scalars and displacement, and zeros for its tractions.
+    """One thread per (lane, number of a record): its scalars and displacement, and zeros for its tractions.
 
     records: (B, R, SCALARS + 3 n + 3 surface): force, moment, areas, then the displacement of all nodes and the
     traction at the surface's nodes.
@@ -200,17 +169,13 @@ def write_record(
     s, i = wp.tid()
     if mask[s] == 0:
         return
-    r = int(numbers[s, RECORD])
-    if i == 0:
-        for k in range(8):
-            records[s, r, k] = sums[s, k]
-    first = SCALARS + 3 * i
-    for k in range(3):
-        records[s, r, first + k] = u[s, i][k]
-    if i < surface:
-        first = SCALARS + 3 * u.shape[1] + 3 * i
-        for k in range(3):
-            records[s, r, first + k] = wp.float64(0.0)
+    r = int(numbers[s, Number.RECORD])
+    if i < SCALARS:
+        records[s, r, i] = sums[s, i]
+    elif i < SCALARS + 3 * nodes:
+        records[s, r, i] = iterate[s, i - SCALARS]
+    else:
+        records[s, r, i] = wp.float64(0.0)
 
 
 @wp.kernel
@@ -227,7 +192,7 @@ def write_tractions(
     s, f = wp.tid()
     if mask[s] == 0 or surface.number[f, 0] < 0:
         return
-    r = int(numbers[s, RECORD])
+    r = int(numbers[s, Number.RECORD])
     for a in range(surface.number.shape[1]):
         share = wp.vec3d()
         for q in range(surface.hat.shape[0]):

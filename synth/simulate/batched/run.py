@@ -87,7 +87,6 @@ class Run:
         self.solver = BatchedSolver(pad, batch, records, (grid[0], grid[1], grid[2]))
         self._orders = np.zeros(batch, dtype=np.int32)
         self._numbers = np.zeros((batch, len(Number)))
-        self._presses: list[Press] = [press for _, (press, _) in islice(waiting, batch)]
         self.lanes: list[Lane | None] = [None] * batch
         self._begun, self._spent = np.zeros(batch), 0.0
 
@@ -98,7 +97,7 @@ class Run:
         """
         began = time.perf_counter()
         over = [(s, lane, self.solver.recorded(s, len(lane.records))) for s, lane in self._ended()]
-        results = [(self._presses[s], lane, fields, float(self._begun[s])) for s, lane, fields in over]
+        begun = self._begun.tolist()
         for s, *_ in over:
             self.lanes[s] = None
         untouched = self._fill()
@@ -106,9 +105,9 @@ class Run:
             self.solver.begin_cycle(self._orders, self._numbers)
         self._spent += time.perf_counter() - began  # without what whoever takes the results does meanwhile
         yield from untouched
-        for press, lane, fields, begun in results:
-            seconds = (self._spent - begun) / self.solver.batch
-            yield lane.press, trajectory(press, lane.records, fields, lane.reason, seconds, self._pad.space)
+        for s, lane, fields in over:
+            seconds = (self._spent - begun[s]) / self.solver.batch
+            yield lane.number, trajectory(lane.press, lane.records, fields, lane.reason, seconds, self._pad.space)
 
     def _ended(self) -> list[tuple[int, Lane]]:
         """Wait for the cycle, if there is one, and ask what the lanes are to do next; those that have ended."""
@@ -132,9 +131,8 @@ class Run:
             if asked is None:
                 break
             number, (press, frames) = asked
-            lane = Lane(number, self._steps(press, frames), self._numbers[s], self._options.forcing)
-            begun[s], self.lanes[s], self._orders[s], self._presses[s] = press, lane, lane.first, press
-            self._begun[s] = self._spent
+            lane = Lane(number, press, self._steps(press, frames), self._numbers[s], self._options.forcing)
+            begun[s], self.lanes[s], self._orders[s], self._begun[s] = press, lane, lane.first, self._spent
         if begun:
             self.solver.fill(begun)
         return untouched

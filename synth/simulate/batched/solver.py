@@ -11,7 +11,7 @@ a Newton iterate change from run to run even for the same batch; what converges 
 another equilibrium (docs/reports/batched_fem.md, Rounding).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from synth.arrays import FloatArray
 from synth.press.press import Press
 from synth.simulate.batched import fields, lane_orders, reductions
 from synth.simulate.batched import krylov as gmres
-from synth.simulate.batched.arrays import BatchArrays, number_rows
+from synth.simulate.batched.arrays import BatchArrays, single_tables
 from synth.simulate.batched.lane_orders import PATH_DERIVATIVE_STEP, Order
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.presses import PressTable, padded
@@ -35,7 +35,7 @@ from synth.simulate.batched.product import (
     store_contact,
 )
 from synth.simulate.bulk import bulk_residual
-from synth.simulate.contact_friction import contact_residual, contact_stiffness
+from synth.simulate.contact_friction import FAR, contact_residual, contact_stiffness
 from synth.simulate.inversion_barrier import barrier_residual
 from synth.simulate.multipliers import augment, update_contact_history
 from synth.simulate.stiffness import viscous_force
@@ -61,20 +61,17 @@ class BatchedSolver:
         self._table = PressTable(batch, device)
         self._presses = self._table.on_device()
         self._barrier = barrier_tables(space, material, device)
-        self._rows = number_rows(space, pad.free, rows, self._bulk, device)
+        self._single = single_tables(space, pad.free, rows, self._bulk, device)
         surface = nodal_weights(space, self._faces.weight.numpy())
         self._surface = struct_of(reductions.SurfaceTables, device, **surface)
         self._product = bulk_product(space.nodes.shape[1], pad.mixed, space.element.stabilisation > 0, pad.yeoh)
         self._contact_product = contact_product(space.faces.shape[1])
-        self._block = gmres.block_size(rows)
+        self._transpose, self._block = pad.preconditioner.dense.transpose, gmres.block_size(rows)
         self._arnoldi, self._solution = gmres.arnoldi(rows), gmres.solution(rows)
         self._arrays = BatchArrays(pad, batch, records, grid)
         self.krylov = self._arrays.krylov
         self._element_dim, self._face_dim = (batch, len(space.nodes)), self._arrays.points[:2]
-        self._value_dim = (batch, len(space.points) + self._arrays.volume.shape[1])
-        self.watch: Callable[[str, str], None] | None = None
-        """Called after each launch with the part of the cycle and the kernel's name, for profiles."""
-        self._part = ""
+        self._value_dim = self._arrays.residual.shape
         self._is_warm, self._graph = False, None
         cuda = wp.get_device(device).is_cuda
         self._seen = wp.empty_like(self._arrays.seen, device="cpu", pinned=cuda)
@@ -83,16 +80,10 @@ class BatchedSolver:
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], *arguments: Any, block: int = 256) -> None:
         wp.launch(kernel, dim, inputs=list(arguments), device=self.device, block_dim=block)
-        self._tell(kernel.key)
 
     def _launch_blocks(self, kernel: wp.Kernel, block: int, *arguments: Any) -> None:
         """One block of so many threads per lane."""
         wp.launch_tiled(kernel, dim=[self.batch], inputs=list(arguments), block_dim=block, device=self.device)
-        self._tell(kernel.key)
-
-    def _tell(self, kernel: str) -> None:
-        if self.watch is not None:
-            self.watch(self._part, kernel)
 
     def begin_cycle(self, orders: np.ndarray, numbers: FloatArray) -> None:
         """Do what all lanes are told; on CUDA queue it.
@@ -105,7 +96,6 @@ class BatchedSolver:
         self._wanted = int(np.bitwise_or.reduce(orders))
         self._end_solves()
         self._begin_steps()
-        self._launch(lane_orders.viscosities, self.batch, a.numbers, a.viscosity)
         self._launch(lane_orders.place_indenters, self.batch, a.orders, a.numbers, self._presses, a.indenters)
         self._solve_and_evaluate()
         wp.copy(self._seen, a.seen)
@@ -121,7 +111,7 @@ class BatchedSolver:
     def _solve_and_evaluate(self) -> None:
         """What every cycle does; on CUDA a graph that is captured the second time, when all kernels are loaded."""
         device = wp.get_device(self.device)
-        if not device.is_cuda or not self._is_warm or self.watch is not None:
+        if not device.is_cuda or not self._is_warm:
             self._launch_all()
             self._is_warm = True
             return
@@ -135,16 +125,15 @@ class BatchedSolver:
 
     def _launch_all(self) -> None:
         a = self._arrays
-        self._launch(lane_orders.select, self.batch, a.orders, int(Order.SOLVE), a.mask)
+        self._launch(lane_orders.select, self.batch, a.orders, Order.SOLVE, a.mask)
         self._linearise()
         for _ in range(INNER_ITERATIONS):
             self._iterate()
-        self._part = "krylov"
         self._launch_blocks(self._solution, self._block, a.krylov, a.seen)
-        self._launch(gmres.release, self.batch, a.krylov, a.orders, a.found)
+        self._launch(gmres.release, self.batch, a.krylov, a.orders, a.numbers, a.share, a.mask)
         self._evaluate()
 
-    def _told(self, *orders: Order) -> bool:
+    def _told(self, *orders: int) -> bool:
         """Whether any lane is told any of these; which ones is then the mask."""
         wanted = sum(orders)
         if not self._wanted & wanted:
@@ -154,45 +143,43 @@ class BatchedSolver:
 
     def _end_solves(self) -> None:
         """Where a Newton solve ended: the iterate, snapshots of it, multipliers, and what is recorded."""
-        a, self._part = self._arrays, "stepping"
-        contact, before = (a.contact.normal, a.contact.tangent), (a.normal_before, a.tangent_before)
+        a = self._arrays
         if self._told(Order.TAKE, Order.RESTORE_PASS, Order.REPEAT, Order.KEEP_STEP, Order.KEEP_PASS):
-            self._launch(fields.to_solution, self._value_dim, a.orders, a.fields)
+            self._launch(fields.to_solution, self._value_dim, a.mask, a.orders, a.fields)
         if self._told(Order.RESTORE_PASS):
-            self._launch(fields.copy_multipliers, a.points, a.mask, *before, *contact)
+            self._launch(fields.copy_memory, a.points, a.mask, a.before_pass, a.memory)
         if self._told(Order.KEEP_STEP):
-            self._launch(fields.copy_memory, a.points, a.mask, a.memory, a.saved)
+            self._launch(fields.copy_memory, a.points, a.mask, a.memory, a.after_step)
         if self._told(Order.ANCHOR):
-            self._update_contact_history(a.fields.iterate_u, 1)
+            self._update_contact_history(a.iterate.u, 1)
         if self._told(Order.KEEP_PASS):
-            self._launch(fields.copy_multipliers, a.points, a.mask, *contact, *before)
+            self._launch(fields.copy_memory, a.points, a.mask, a.memory, a.before_pass)
         if self._told(Order.FORCE, Order.RECORD):
-            self._launch(reductions.clear_sums, a.sums.shape, a.mask, a.sums)
-            found = (a.fields.iterate_u, self._faces, a.indenters, a.traction, a.tangential)
+            a.sums.zero_()
+            found = (a.iterate.u, self._faces, a.indenters, a.traction, a.tangential)
             self._launch(reductions.contact_forces, self._face_dim, a.mask, *found, a.sums)
-            self._launch(reductions.press_forces, self.batch, a.mask, self._presses.axes, a.sums, a.seen)
         if self._told(Order.RECORD):
-            u, surface = a.fields.iterate_u, len(self.pad.space.surface_nodes)
-            self._launch(reductions.write_record, u.shape, a.mask, a.numbers, u, a.sums, surface, a.records)
-            where = (self._faces, self._surface, a.traction, u.shape[1])
+            written, size = (a.fields.iterate, a.nodes, a.sums, a.records), (self.batch, a.records.shape[2])
+            self._launch(reductions.write_record, size, a.mask, a.numbers, *written)
+            where = (self._faces, self._surface, a.traction, a.nodes)
             self._launch(reductions.write_tractions, self._face_dim, a.mask, a.numbers, *where, a.records)
 
     def _begin_steps(self) -> None:
         """Steps that are accepted, passes and steps that begin."""
         a = self._arrays
         if self._told(Order.RESTORE_STEP):
-            self._launch(fields.copy_memory, a.points, a.mask, a.saved, a.memory)
-        self._launch(lane_orders.set_stiffness, self.batch, a.numbers, self._presses, a.indenters)
+            self._launch(fields.copy_memory, a.points, a.mask, a.after_step, a.memory)
+        wp.copy(a.indenters.sharpness, a.stiffness)
         if self._told(Order.RESTORE_STEP, Order.ACCEPT, Order.BEGIN):
-            self._launch(fields.to_start, self._value_dim, a.orders, a.numbers, a.fields)
+            self._launch(fields.to_start, self._value_dim, a.mask, a.orders, a.numbers, a.fields)
         if self._told(Order.ACCEPT):
-            self._update_contact_history(a.fields.state_u, 0)
+            self._update_contact_history(a.state.u, 0)
         if self._told(Order.PREDICT):
-            where = (self._rows.node_row, self._rows.pressure_row, a.fields)
-            self._launch(fields.apply_predictor, self._value_dim, a.orders, PATH_DERIVATIVE_STEP, a.step, *where)
+            where = (PATH_DERIVATIVE_STEP, a.step, self._single.row, a.fields)
+            self._launch(fields.apply_predictor, self._value_dim, a.mask, *where)
         if self._told(Order.AUGMENT):
-            self._launch(lane_orders.augmented_shares, self.batch, a.orders, a.numbers, a.shares)
-            self._launch(augment, a.points, a.shares, a.indenters, a.gap, a.tangential, PENALTY, a.contact)
+            found = (a.indenters, a.gap, a.tangential, PENALTY, a.contact)
+            self._launch(augment, a.points, a.mask, a.asked_share, *found)
 
     def _update_contact_history(self, u: wp.array, new_only: int) -> None:
         a = self._arrays
@@ -201,75 +188,67 @@ class BatchedSolver:
 
     def _evaluate(self) -> None:
         """Evaluate the residuals of iterates and trials."""
-        a, self._part = self._arrays, "residual"
-        f, mask, elements = a.fields, a.mask, self._element_dim
-        self._launch(lane_orders.select_evaluated, self.batch, a.orders, a.found, mask)
-        where, residual = (self._rows.node_row, self._rows.pressure_row), (a.force, a.volume, a.jacobian)
-        trial = (a.orders, a.numbers, a.found, mask, a.step, *where, f, a.force, a.viscous, a.volume)
-        self._launch(fields.compute_trial, self._value_dim, *trial)
-        self._launch(bulk_residual, elements, f.trial_u, f.trial_p, mask, self._bulk, *residual)
+        a = self._arrays
+        mask, elements, row, u = a.mask, self._element_dim, self._single.row, a.trial.u
+        trial = (a.share, a.step, row, a.fields, a.residual, a.viscous)
+        self._launch(fields.compute_trial, self._value_dim, mask, *trial)
+        self._launch(bulk_residual, elements, *a.trial, mask, self._bulk, *a.forces, a.jacobian)
         if self._barrier is not None:
-            self._launch(barrier_residual, elements, f.trial_u, mask, self._barrier, a.force, a.jacobian)
-        law, found = (self._faces, a.indenters, a.contact, PENALTY), (a.force, a.gap, a.tangential, a.traction)
-        self._launch(contact_residual, self._face_dim, f.trial_u, mask, *law, *found)
-        self._launch_blocks(
-            reductions.residual_norms, reductions.BLOCK, mask, *residual, self._rows.node_row, f, a.seen
-        )
-        self._launch(reductions.penetrations, self._face_dim, mask, a.gap, a.seen)
-        self._launch(viscous_force, elements, mask, f.iterate_u, f.trial_u, a.viscosity, self._bulk, a.viscous)
-        moved = (a.force, a.viscous, a.volume, *where, gmres.flat(a.krylov.basis), a.orders, a.numbers)
+            self._launch(barrier_residual, elements, u, mask, self._barrier, a.forces.u, a.jacobian)
+        law, found = (self._faces, a.indenters, a.contact, PENALTY), (a.forces.u, a.gap, a.tangential, a.traction)
+        self._launch(contact_residual, self._face_dim, u, mask, *law, *found)
+        norms = (mask, a.residual, a.nodes, a.jacobian, a.gaps, row, a.fields)
+        self._launch_blocks(reductions.residual_norms, reductions.BLOCK, *norms, a.seen)
+        self._launch(viscous_force, elements, mask, a.iterate.u, u, a.viscosity, self._bulk, a.viscous_forces.u)
+        moved = (a.residual, a.nodes, a.viscous, row, gmres.flat(a.krylov.basis), a.share, a.numbers)
         self._launch_blocks(reductions.relaxation_errors, reductions.BLOCK, mask, *moved, a.seen)
 
     def _linearise(self) -> None:
-        a, self._part = self._arrays, "tangent"
-        f, mask, elements = a.fields, a.mask, self._element_dim[::-1]
-        self._launch(store_bulk, elements, mask, f.iterate_u, f.iterate_p, self._bulk, a.viscosity, a.stored)
+        a = self._arrays
+        u, mask, elements = a.iterate.u, a.mask, self._element_dim[::-1]
+        self._launch(store_bulk, elements, mask, *a.iterate, self._bulk, a.viscosity, a.stored)
         if self._barrier is not None:
-            self._launch(find_inverting, elements, mask, f.iterate_u, self._barrier, a.inverting)
+            self._launch(find_inverting, elements, mask, u, self._barrier, a.inverting)
         law, matrices = (self._faces, a.indenters, a.contact, PENALTY), (a.symmetric, a.remainder)
-        self._launch(contact_stiffness, self._face_dim, f.iterate_u, mask, *law, np.inf, a.touching, *matrices)
-        stored = (a.stored_contact, a.touched)
-        self._launch(store_contact, self._face_dim, mask, a.touching, self._faces.weight, *matrices, *stored)
-        right = (self._rows.free, a.force, a.volume, a.krylov)
-        self._launch(gmres.begin_vectors, a.krylov.step.shape, mask, a.numbers, *right)
-        self._launch(gmres.begin_solve, self.batch, mask, a.numbers, a.krylov)
+        self._launch(contact_stiffness, self._face_dim, u, mask, *law, np.inf, a.touching, *matrices)
+        stored = (a.touching, self._faces.weight, *matrices, a.stored_contact)
+        self._launch(store_contact, self._face_dim, mask, *stored)
+        right = (self._single.unknown, a.residual, a.krylov)
+        self._launch(gmres.begin_solves, a.krylov.step.shape, mask, a.numbers, *right)
 
     def _iterate(self) -> None:
-        a, k, elements, preconditioner = self._arrays, self.krylov, self._element_dim[::-1], self.pad.preconditioner
-        self._part = "preconditioner"
-        preconditioner.apply(k)
-        self._tell("product with the inverse")
-        self._part = "product"
-        preconditioner.dense.transpose(gmres.flat(k.preconditioned), k.corrected)
-        self._tell("transpose")
+        self.pad.preconditioner.apply(self.krylov)
+        self._multiply()
+        self._launch_blocks(self._arnoldi, self._block, self.krylov)
+
+    def _multiply(self) -> None:
+        """The tangent times the preconditioned vectors."""
+        a, k, elements, transpose = self._arrays, self.krylov, self._element_dim[::-1], self._transpose
+        transpose(gmres.flat(k.preconditioned), k.corrected)
         k.image.zero_()
-        self._tell("zeros")
         found = (a.stored, k.corrected, k.image)
-        self._launch(self._product, elements, k.running, self._rows.single, *found, block=BLOCK)
+        self._launch(self._product, elements, k.running, self._single, *found, block=BLOCK)
         if self._barrier is not None:
-            where = (a.inverting, a.fields.iterate_u, self._barrier, self._rows.single.row)
+            where = (a.inverting, a.iterate.u, self._barrier, self._single)
             self._launch(barrier_product, elements, k.running, *where, k.corrected, k.image)
-        contact = (a.touched, self._rows.face_row, self._rows.face_shape, a.stored_contact)
+        contact = (a.touching, self._single, a.stored_contact)
         self._launch(self._contact_product, self._face_dim, k.running, *contact, k.corrected, k.image)
-        preconditioner.dense.transpose(k.image, gmres.flat(k.product))
-        self._tell("transpose")
-        self._part = "krylov"
-        self._launch_blocks(self._arnoldi, self._block, k)
+        transpose(k.image, gmres.flat(k.product))
 
     def fill(self, presses: Mapping[int, Press]) -> None:
         """Begin presses, by lane."""
-        a, indenters, fresh = self._arrays, self._arrays.indenters, np.zeros(self.batch, dtype=np.int32)
+        a, indenters = self._arrays, self._arrays.indenters
+        untouched = (a.fields.state, a.fields.previous, a.contact.normal, a.contact.tangent, a.contact.anchored)
         for s, press in presses.items():
             self._table.put(s, press)
-            fresh[s] = 1
+            for values in untouched:
+                values[s].zero_()
+            a.contact.gap[s].fill_(FAR)
             if indenters.coefficients.size > self.batch:
                 indenters.coefficients[s].assign(padded(press.path.body.coefficients, indenters.coefficients.shape[1:]))
         self._presses = self._table.on_device()
         indenters.kind.assign(self._table.kind)
         indenters.shape.assign(self._table.shape)
-        a.mask.assign(fresh)
-        self._launch(fields.clear_fields, self._value_dim, a.mask, a.fields)
-        self._launch(fields.clear_contact, a.points, a.mask, a.contact)
 
     def recorded(self, lane: int, count: int) -> FloatArray:
         """The first states that a lane has recorded, a copy: its next press writes into the same memory.
