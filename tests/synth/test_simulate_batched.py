@@ -1,5 +1,6 @@
 """Many trajectories at once against one by one."""
 
+from collections import deque
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -107,7 +108,7 @@ def test_company_order_and_lost_samples_change_no_bit() -> None:
 
 def test_a_lane_goes_back_to_its_snapshots_and_begins_afresh() -> None:
     press = Press.of(scene(friction=0.4), MESH)
-    solver = Run([(0, (press, None))], iter([]), prepare(press.scene, MESH, "cpu"), OPTIONS).solver
+    solver = Run(deque([(0, (press, None))]), iter([]), 1, prepare(press.scene, MESH, "cpu"), OPTIONS).solver
     contact, iterate = solver._arrays.contact, solver._arrays.fields.iterate
     changing = (iterate, contact.normal, contact.tangent, contact.anchor, contact.anchored)
     for keep, restore in ((Order.KEEP_PASS, Order.RESTORE_PASS), (Order.KEEP_STEP, Order.RESTORE_STEP)):
