@@ -211,6 +211,9 @@ class TrainConfig(_Frozen):
     compression: float = Field(default=0.0, ge=0, le=1)
     """Largest step of a random compression of pairs with exact flow, except those of bare gels, in units of white;
     see `gelflow.ops.compression`. Recordings are compressed, rendered images are not."""
+    specks: float = Field(default=0.0, ge=0, le=1)
+    """Share of the pairs with exact flow, except those of bare gels, that get random specks in the optics, which stand
+    still; see `gelflow.training.specks`."""
     motion: MotionConfig | None = None
     """Motion added to each pair but those of bare gels, for a network that meets larger motions than its training pairs
     show; None: none (the paper is silent)."""

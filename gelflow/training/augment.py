@@ -1,4 +1,4 @@
-"""Augmentation of whole batches, on whatever device they are: motion, flips, colours, compression.
+"""Augmentation of whole batches, on whatever device they are: motion, flips, colours, specks, compression.
 
 Motion: image 2 is read at ``A(y) = c + M (y - c) + t``, c its centre and M = s R, so that what lay at A(y) lies at y. A
 point of image 1 that was found at x + V(x) is then found at ``x + V'(x) = c + M^-1 (x + V(x) - c - t)``. The flow stays
@@ -11,8 +11,9 @@ where the lights are that gives slopes their colours. Changed so they would be p
 Each pair has its own random numbers. They are sampled on the CPU and copied asynchronously, so that a GPU need not
 finish a step before the CPU prepares the next.
 
-Compression comes last, by a step that is log-uniform between MILDEST times the configured one and that one. Only pairs
-with exact flow are compressed, and those of bare gels are not.
+Specks in the optics (`gelflow.training.specks`) stand still, whatever moves. Compression comes last, by a step that is
+log-uniform between MILDEST times the configured one and that one. Only pairs with exact flow get either, and those of
+bare gels do not.
 """
 
 import math
@@ -28,6 +29,7 @@ from gelflow.arrays import Flow, Images
 from gelflow.config import MotionConfig, TrainConfig
 from gelflow.ops.compression import compressed
 from gelflow.ops.warp import from_centre, warp
+from gelflow.training.specks import specked
 
 UNCHANGED = np.array([1, 0, 0, 1, 1, 0, 0, 1, 0, 0, 1, 1, 1, 1, 1, 0], np.float32)
 """Random numbers, in the order of `_sampled`, that leave a pair as it is."""
@@ -64,11 +66,19 @@ def augmented(batch: dict[str, Any], config: TrainConfig, randoms: Sequence[np.r
         gain = numbers[:, 12:15, None, None]
         for key in ("image1", "image2"):
             new[key] = (new[key] * gain).clamp(0, 1)
-    if config.compression > 0 and "flow" in new:
-        # Recordings, which have no flow, are compressed already.
-        steps = numbers[:, 15] * torch.isfinite(new["flow"]).flatten(1).any(dim=1)
+    if "flow" not in new:
+        return new
+    # Recordings, which have no flow, have their own specks and are compressed already.
+    known = torch.isfinite(new["flow"]).flatten(1).any(dim=1)
+    if config.specks > 0:
+        both = torch.stack([new["image1"], new["image2"]], dim=1)
+        for place, (bare, random) in enumerate(zip(batch["bare"], randoms, strict=True)):
+            if not bare and random.random() < config.specks:
+                both[place] = torch.where(known[place], specked(both[place], random), both[place])
+        new["image1"], new["image2"] = both.unbind(dim=1)
+    if config.compression > 0:
         for key in ("image1", "image2"):
-            new[key] = compressed(new[key], steps)
+            new[key] = compressed(new[key], numbers[:, 15] * known)
     return new
 
 

@@ -54,6 +54,7 @@ def fine_tuning_settings(method: Learned, steps: int, pairs: int) -> TrainConfig
         "motion": None,
         "color_jitter": 0.0,
         "compression": 0.0,
+        "specks": 0.0,
         "ema_decay": 0.0,
         "schedule": "constant",
         "warmup_steps": 0,

@@ -2,7 +2,8 @@
 # Trains weights as the shipped ones were, on NVIDIA GPUs: bash gelflow/weights/train.sh CLIPS OUT
 #
 # CLIPS is a folder of videos of a real gel. DEVICES is the number of GPUs of the fifth and sixth stage, PAIRS that of
-# pairs of a scene in the first. The first four stages of the shipped weights used the scenes of version 0.1.0.
+# pairs of a scene in the first. The first four stages of the shipped weights used the scenes of version 0.1.0. They
+# are those of the ninth stage: the tenth and the eleventh, with specks and on finer truth, are for the next ones.
 set -euo pipefail
 clips=$1 out=$2 devices=${DEVICES:-1} n=${PAIRS:-900} here=$(cd "$(dirname "$0")" && pwd)
 others="densetact fingervision gelsight gelsight_fingertip gelslim gelstereo omnitact tac3d"
@@ -14,12 +15,12 @@ pairs() { # NAME SCENE N SEED PAIRS_PER_TRAJECTORY, further options
 }
 
 finetune() { # NAME FROM STEPS LEARNING_RATE WARMUP_STEPS SEED, folders of pairs and further options
-    python -m gelflow finetune "$out/real" "${@:7}" --config real \
+    python -m gelflow finetune "${@:7}" --config real \
         --weights "$out/$2/weights.safetensors" $network --set ema_decay=0.999 --steps "$3" \
         --set learning_rate="$4" --set warmup_steps="$5" --set seed="$6" --out "$out/$1"
 }
 
-denoise() { # NAME FROM STEPS SEED COMPRESSION, folders of pairs: trains the denoiser alone, without added motion
+denoise() { # NAME FROM STEPS SEED COMPRESSION, folders of pairs and options: the denoiser alone, without added motion
     python -m gelflow finetune "${@:6}" --config real --weights "$out/$2/weights.safetensors" $network --steps "$3" \
         --set supervision=registered --set model.denoise=true --set motion.shift_px=0 --set motion.turn_deg=0 \
         --set motion.zoom=0 --set ema_decay=0.999 --set learning_rate=1e-3 --set warmup_steps=200 --set seed="$4" \
@@ -38,7 +39,19 @@ everything() { # FOLDER SEED: pairs of all scenes
     pairs "$1"/turned "$here/gelsight_mini_far.toml" "$n" "$2" 5 $together $turned
 }
 
+fine() { # FOLDER SEED: pairs of sparse marks, each on a mesh of its own that meets the target, by the direct solver
+    local scene
+    for scene in gelslim gelsight_fingertip fingervision tac3d tac3d_single gelsight_mini gelstereo; do
+        pairs "$1/$scene" "$scene" $((n * 2 / 3)) "$2" 6 $finely=0.2
+    done
+    pairs "$1"/any_pattern "$here/any_pattern.toml" $((n * 2 / 3)) "$2" 6 $finely=0.4
+    for scene in deltact digit; do
+        pairs "$1/$scene" "$scene" $((n / 3)) "$2" 6 $finely=0.5
+    done
+}
+
 together="--workers 3 --set numerics.solver=batched"
+finely="--set numerics.solver=single --set numerics.target_error_px"
 turned="--set motion.twist_deg={uniform=[-45.0,45.0]}"
 network="--device cuda --set precision=bf16 --set batch_size=16 --set crop_size=[240,320]"
 
@@ -55,15 +68,18 @@ everything again 43
 n=250 everything fresh 97
 n=285 everything more 101
 n=255 everything most 103
+fine fine 107
 
 two="$out/first/deltact $out/first/soft_bubble"
 python -m gelflow train "$out"/first/* "$out/far" --config best $network \
     --set learning_rate=5e-4 --set warmup_steps=661 --steps 13220 --out "$out/1"
-finetune 2 1 5301 1e-4 265 0 "$out/far" $two "$out/first/gelsight_mini"
-finetune 3 2 15062 3e-4 265 0 "$out/far" $two "$out"/few/* "$out/bare"
-finetune 4 3 9646 2e-4 192 1 "$out/far" "$out/turned" $two "$out"/few/* "$out/bare"
-finetune 5 4 8157 3e-4 300 2 "$out"/all/* --devices "$devices"
-finetune 6 5 8500 3e-4 300 3 "$out"/again/* --devices "$devices"
+finetune 2 1 5301 1e-4 265 0 "$out/real" "$out/far" $two "$out/first/gelsight_mini"
+finetune 3 2 15062 3e-4 265 0 "$out/real" "$out/far" $two "$out"/few/* "$out/bare"
+finetune 4 3 9646 2e-4 192 1 "$out/real" "$out/far" "$out/turned" $two "$out"/few/* "$out/bare"
+finetune 5 4 8157 3e-4 300 2 "$out/real" "$out"/all/* --devices "$devices"
+finetune 6 5 8500 3e-4 300 3 "$out/real" "$out"/again/* --devices "$devices"
 denoise 7 6 4300 0 0 "$out"/fresh/*
 denoise 8 7 5800 5 0 "$out"/more/*
 denoise 9 8 5000 5 0.0625 "$out"/most/*
+finetune 10 9 2500 2e-4 100 4 "$out"/fine/* --set specks=0.5 --set compression=0.03125
+denoise 11 10 2500 6 0.0625 "$out"/fine/* --set specks=0.5

@@ -119,7 +119,7 @@ SMALL = ModelConfig(levels=4, projected_channels=8)
 UNSUITABLE: dict[str, Any] = {
     "loss": {"lambda_s": [1.0, 1.0, 0.5], "alpha": 0.5},
     "supervision": "mixed", "mixed_self": 3.0, "motion": MotionConfig(), "color_jitter": 0.2, "crop_size": (64, 64),
-    "compression": 0.1,
+    "compression": 0.1, "specks": 0.5,
     "ema_decay": 0.999, "schedule": "one_cycle", "warmup_steps": 100, "learning_rate": 4e-4, "batch_size": 16,
     "gradient_clip": 1.0, "flip": False, "seed": 5, "devices": 2, "workers": 3, "device": "cuda",
 }  # fmt: skip
@@ -139,7 +139,7 @@ def test_whatever_the_preset_the_pairs_are_seen_as_they_are_and_without_truth(pr
     method = Learned(random_weights(tmp_path / "w.safetensors", model, recorded, recorded.image_size), device="cpu")
     found = fine_tuning_settings(method, 1600, pairs=8)
     assert (found.supervision, found.motion, found.crop_size) == ("self", None, None)
-    assert found.color_jitter == found.compression == 0
+    assert found.color_jitter == found.compression == found.specks == 0
     assert (found.schedule, found.warmup_steps, found.learning_rate, found.ema_decay) == ("constant", 0, rate, 0)
     assert (found.image_size, found.loss, found.model) == (recorded.image_size, recorded.loss, model)
     assert found.batch_size == 4  # the paper's, so that 1600 steps are 800 epochs
