@@ -140,7 +140,7 @@ def press_of(scene: Scene, mesh: PadMesh, setting: Setting) -> DirectPress:
     numerics = scene.numerics.model_copy(update=setting.numerics)
     space = function_space(mesh, ELEMENTS[setting.element](setting.contact_split))
     gel, options = scene.sensor.gel, setting.options
-    system = System(space, pad_material(gel, mesh), numerics.penalty, options=options)
+    system = System(space, pad_material(gel, mesh), options)
     path = path_of(scene, None, mesh.spacing_mm / (2 * space.element.order))
     steps = LoadSteps(path, mesh.size_mm, scene.contact.friction > 0, numerics, options)
     return DirectPress(system, path, scene.contact.friction, gel.youngs_modulus_kpa / 1000, steps)

@@ -41,7 +41,7 @@ class Indenters:
         centre: (B,) world position of the origin of the indenter's frame, mm.
         rotation: (B,) its frame's axes as columns.
         friction: (B,) Coulomb coefficient.
-        sharpness: (B,) factor on the contact stiffness ε; see `synth.press.indenter`.
+        stiffness: (B,) of contact, ε, E per mm.
     """
 
     kind: wp.array(dtype=wp.int32)
@@ -50,7 +50,7 @@ class Indenters:
     centre: wp.array(dtype=wp.vec3d)
     rotation: wp.array(dtype=wp.mat33d)
     friction: wp.array(dtype=wp.float64)
-    sharpness: wp.array(dtype=wp.float64)
+    stiffness: wp.array(dtype=wp.float64)
 
 
 @wp.struct
@@ -152,7 +152,6 @@ def contact_residual(
     faces: Faces,
     indenters: Indenters,
     state: ContactState,
-    penalty: wp.float64,
     residual: wp.array2d(dtype=wp.vec3d),
     gap: wp.array3d(dtype=wp.float64),
     tangential: wp.array3d(dtype=wp.vec3d),
@@ -166,7 +165,7 @@ def contact_residual(
     if active[s] == 0:
         return
     rotation = indenters.rotation[s]
-    stiffness = penalty * indenters.sharpness[s]
+    stiffness = indenters.stiffness[s]
     far = _is_far(faces, indenters, u, s, f)
     for q in range(faces.weight.shape[1]):
         if far:
@@ -202,7 +201,6 @@ def contact_stiffness(
     faces: Faces,
     indenters: Indenters,
     state: ContactState,
-    penalty: wp.float64,
     max_turn: wp.float64,
     touching: wp.array2d(dtype=wp.int32),
     symmetric: wp.array3d(dtype=wp.mat33d),
@@ -221,7 +219,7 @@ def contact_stiffness(
         return
     rotation = indenters.rotation[s]
     friction = indenters.friction[s]
-    stiffness = penalty * indenters.sharpness[s]
+    stiffness = indenters.stiffness[s]
     identity = wp.identity(n=3, dtype=wp.float64)
     zero = wp.mat33d()
     half = wp.float64(0.5)

@@ -36,11 +36,11 @@ class Point:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The iterate, what contact remembers, and the factor on the contact stiffness."""
+    """The iterate, what contact remembers, and its stiffness."""
 
     point: Point
     contact: dict[str, np.ndarray]
-    sharpness: float
+    stiffness: float
 
 
 def led(policy: ask.Asking[ask.T], answer: Callable[[ask.Request], Any]) -> ask.T:
@@ -122,12 +122,12 @@ class DirectSolver:
         return missed / max(norm(iterate.residual.free), np.finfo(float).tiny)
 
     def _snapshot(self) -> Snapshot:
-        return Snapshot(self.iterate, self.system.saved_contact(), float(self.indenter.sharpness.numpy()[0]))
+        return Snapshot(self.iterate, self.system.saved_contact(), float(self.indenter.stiffness.numpy()[0]))
 
     def _restore(self, kept: Snapshot) -> None:
         self.iterate = kept.point
         self.system.restore_contact(kept.contact)
-        self.indenter.sharpness.fill_(kept.sharpness)
+        self.indenter.stiffness.fill_(kept.stiffness)
 
     def _update_history(self, new_only: int) -> None:
         iterate = self.iterate
@@ -145,10 +145,12 @@ class DirectPress(DirectSolver):
     """
 
     def __init__(self, system: System, path: LoadPath, friction: float, modulus_mpa: float, steps: LoadSteps) -> None:
-        super().__init__(system, pack_indenter(path, friction))
+        penalty = steps.numerics.penalty
+        super().__init__(system, pack_indenter(path, friction, penalty))
         self.path, self.steps, self._modulus = path, steps, modulus_mpa
-        self._sticking = pack_indenter(path, ask.STICK_FRICTION)
+        self._sticking = pack_indenter(path, ask.STICK_FRICTION, penalty)
         self._sticking.centre, self._sticking.rotation = self.indenter.centre, self.indenter.rotation
+        self._own_stiffness = float(self.indenter.stiffness.numpy()[0])
         self.state = self._previous = system.zero()
         self._at = self._target = 0.0
         self.states: list[State] = []
@@ -174,7 +176,7 @@ class DirectPress(DirectSolver):
             case ask.Begin():
                 return self._begin(request)
             case ask.Augment(share, stiffening):
-                self.indenter.sharpness.fill_(stiffening * self.path.body.sharpness)
+                self.indenter.stiffness.fill_(stiffening * self._own_stiffness)
                 self.system.augment(self.iterate.residual, self.indenter, share)
                 return self.start(self.iterate.state)
             case ask.Do.FORCE:

@@ -15,7 +15,6 @@ def augment(
     indenters: Indenters,
     gap: wp.array3d(dtype=wp.float64),
     tangential: wp.array3d(dtype=wp.vec3d),
-    penalty: wp.float64,
     state: ContactState,
 ):
     """Normal multipliers grow by a share (B,) of stiffness times penetration; tangential ones follow the traction.
@@ -25,7 +24,7 @@ def augment(
     s, f, q = wp.tid()
     if active[s] == 0:
         return
-    stiffness = penalty * indenters.sharpness[s]
+    stiffness = indenters.stiffness[s]
     before = state.normal[s, f, q]
     state.normal[s, f, q] = wp.max(wp.float64(0.0), before - share[s] * stiffness * gap[s, f, q])
     if state.anchored[s, f, q] == 1:
@@ -42,7 +41,6 @@ def update_contact_history(
     indenters: Indenters,
     gap: wp.array3d(dtype=wp.float64),
     tangential: wp.array3d(dtype=wp.vec3d),
-    penalty: wp.float64,
     new_only: int,
     state: ContactState,
 ):
@@ -58,7 +56,7 @@ def update_contact_history(
     y = zero
     if gap[s, f, q] < FAR:
         y = wp.transpose(rotation) * (position(faces, u, s, f, q) - indenters.centre[s])
-    stiffness = penalty * indenters.sharpness[s]
+    stiffness = indenters.stiffness[s]
     pressure = state.normal[s, f, q] - stiffness * gap[s, f, q]
     if pressure > wp.float64(0.0) and state.anchored[s, f, q] == 0:
         anchor = anchor_of(state, y, gap[s, f, q], s, f, q)

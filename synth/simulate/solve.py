@@ -73,7 +73,7 @@ def direct_press(
     """A press at the start of its load path, on a part of its gel's space, default all of it; see `simulate_press`."""
     scene, gel, numerics = press.scene, press.scene.sensor.gel, press.scene.numerics
     space = space or space_of(press)
-    system = System(space, pad_material(gel, space.mesh), numerics.penalty, options)
+    system = System(space, pad_material(gel, space.mesh), options)
     modulus_mpa = gel.youngs_modulus_kpa / 1000
     steps = LoadSteps(press.path, space.mesh.size_mm, scene.contact.friction > 0, numerics, options, frames)
     return DirectPress(system, press.path, scene.contact.friction, modulus_mpa, steps)

@@ -90,14 +90,11 @@ class Tangent:
 class System:
     """Kernels, arrays and sparse pattern of one pad, its space and its elements' material; see the module's docstring.
 
-    The penalty is the contact stiffness, E per mm. Of the options precision and use of the linear solver's factors
-    count.
+    Of the options precision and use of the linear solver's factors count.
     """
 
-    def __init__(
-        self, space: Space, material: Material, penalty: float = 50.0, options: SolverOptions = STANDARD
-    ) -> None:
-        self.space, self.penalty = space, penalty
+    def __init__(self, space: Space, material: Material, options: SolverOptions = STANDARD) -> None:
+        self.space = space
         self.mixed = material.mixed and space.element.has_pressure
         self._pattern = pattern_of(space, self.mixed)
         self._linear_solver = LinearSolver(self._pattern.factor(options.single_precision), options.reuse_factors)
@@ -148,7 +145,7 @@ class System:
         _launch(bulk_residual, elements, u, p, self._active, self._bulk, force, volume, jacobian)
         if self._barrier is not None:
             _launch(barrier_residual, elements, u, self._active, self._barrier, force, jacobian)
-        contact = [u, self._active, self._faces, indenter, self.contact, self.penalty]
+        contact = [u, self._active, self._faces, indenter, self.contact]
         at_points = [wp.empty(self._points, dtype=dtype, device="cpu") for dtype in (wp.float64, wp.vec3d, wp.vec3d)]
         _launch(contact_residual, self._points[:2], *contact, force, *at_points)
         reaction = force.numpy()[0]
@@ -170,7 +167,7 @@ class System:
         if self.mixed:
             slots = [self._coupling_slot, self._pressure_slot]
             _launch(pressure_tangent, elements, active, self._bulk, held, pushed, *slots, values)
-        contact = [u, active, self._faces, indenter, self.contact, self.penalty]
+        contact = [u, active, self._faces, indenter, self.contact]
         faces, touching, remainder = self._points[:2], self._touching, self._remainder
         _launch(contact_stiffness, faces, *contact, turn, touching, self._stiffness, remainder)
         blocks = [self._faces, self._face_pairs, touching, self._stiffness, self._face_slot]
@@ -217,16 +214,14 @@ class System:
     def augment(self, at: Residual, indenter: Indenters, share: float = 1.0) -> None:
         """Augmented-Lagrangian update at a solution, by its residual: a share of it, 1 for all of it."""
         amount = _array(np.array([share]), wp.float64)
-        _launch(
-            augment, self._points, self._active, amount, indenter, at.gap, at.tangential, self.penalty, self.contact
-        )
+        _launch(augment, self._points, self._active, amount, indenter, at.gap, at.tangential, self.contact)
 
     def update_contact_history(self, state: Unknowns, at: Residual, indenter: Indenters, new_only: int = 0) -> None:
         """Accept a step: friction's anchors follow. If new_only, points that touch for the first time are anchored.
 
         `at` is the residual of the state.
         """
-        where, found = [self._active, self._faces, indenter], [at.gap, at.tangential, self.penalty]
+        where, found = [self._active, self._faces, indenter], [at.gap, at.tangential]
         _launch(update_contact_history, self._points, _on_device(state)[0], *where, *found, new_only, self.contact)
 
     def saved_contact(self) -> dict[str, np.ndarray]:

@@ -116,11 +116,14 @@ def nodal_weights(space: Space, weight: FloatArray) -> dict[str, np.ndarray]:
     return {"hat": hat, "number": number, "area": area}
 
 
-def pack_indenter(path: LoadPath, friction: float) -> Indenters:
-    """The body of a path, on the CPU; `place_indenter` says where it is."""
+def pack_indenter(path: LoadPath, friction: float, penalty: float) -> Indenters:
+    """The body of a path, on the CPU; `place_indenter` says where it is.
+
+    penalty: the contact stiffness of a blunt body, E per mm.
+    """
     body, nowhere = path.body, {"centre": np.zeros((1, 3)), "rotation": np.zeros((1, 3, 3))}
     shape = {"kind": [body.kind], "shape": [body.shape], "coefficients": [body.coefficients]}
-    return struct_of(Indenters, "cpu", friction=[friction], sharpness=[body.sharpness], **shape, **nowhere)
+    return struct_of(Indenters, "cpu", friction=[friction], stiffness=[penalty * body.sharpness], **shape, **nowhere)
 
 
 def place_indenter(packed: Indenters, pose: Pose) -> None:

@@ -28,6 +28,7 @@ from scipy.optimize import brentq
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import PadMesh
 from synth.mesh.element import Element
+from synth.scene import Numerics
 from synth.simulate.contact_friction import Indenters
 from synth.simulate.material import uniform
 from synth.simulate.system import System
@@ -163,10 +164,11 @@ def lowered(shape: dict[str, object], depth: float, thickness: float) -> Indente
 
 def press(quarter: System, indenter: Indenters, penalties: tuple[float, ...] = (20.0, 200.0)) -> float:
     """Force of the whole layer over E, mm²: at rising penalties, then with updates that leave less than 0.5 % of it."""
+    sharpness = float(indenter.stiffness.numpy()[0]) / Numerics().penalty
     state, residual = quarter.zero(), quarter.residual(quarter.zero(), indenter)
     for k in range(len(penalties) + 2):
         if k < len(penalties):
-            quarter.penalty = penalties[k]
+            indenter.stiffness.fill_(penalties[k] * sharpness)
         else:
             quarter.augment(residual, indenter)
         solution = found_by_newton(quarter, state, indenter, TOLERANCE)

@@ -125,9 +125,9 @@ def complete(posed: Scene, mesh: PadMesh, folder: Path | None = None, **options:
     return result
 
 
-def system(mesh: PadMesh, poisson_ratio: float, penalty: float = 50.0, element: Element | None = None) -> System:
+def system(mesh: PadMesh, poisson_ratio: float, element: Element | None = None) -> System:
     space = function_space(mesh, element or p1p1())
-    return System(space, uniform(len(mesh.tets), poisson_ratio), penalty)
+    return System(space, uniform(len(mesh.tets), poisson_ratio))
 
 
 def run(posed: Scene, mesh: PadMesh) -> DirectPress:
@@ -169,7 +169,7 @@ def dense(body: System, tangent: Tangent) -> FloatArray:
 def indenters(posed: Scene, at: float) -> Indenters:
     """The kernels' view of a scene's indenter at a path length (mm)."""
     path = LoadPath(posed.motion, rigid_body(posed.contact.indenter))
-    packed = pack_indenter(path, posed.contact.friction)
+    packed = pack_indenter(path, posed.contact.friction, posed.numerics.penalty)
     place_indenter(packed, path.pose(at))
     return packed
 

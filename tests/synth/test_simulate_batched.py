@@ -219,7 +219,7 @@ def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, sti
     touching = zeros(points[:2], wp.int32)
     symmetric, remainder = (zeros(points, wp.mat33d) for _ in range(2))
     contact = zeros(points, wp.mat33f)
-    inputs = [displacement, mask, faces, bodies, body.contact, body.penalty, np.inf]
+    inputs = [displacement, mask, faces, bodies, body.contact, np.inf]
     launch(contact_stiffness, points[:2], inputs, [touching, symmetric, remainder])
     assert (touching.numpy() == 2).any()
     launch(store_contact, points[:2], [mask, touching, faces.weight, symmetric, remainder], [contact])

@@ -75,7 +75,7 @@ class Ledger(System):
             # The anchor follows the slip, along which the traction on the gel points back.
             rubbed = ((now.rubbing + before.rubbing) / 2 * moved).sum(axis=-1)
             account.lost -= float((weight * rubbed).sum())
-        account.springs = float((weight * (whole**2).sum(axis=-1)).sum()) / (2 * self.penalty)
+        account.springs = float((weight * (whole**2).sum(axis=-1)).sum() / (2 * indenter.stiffness.numpy()[0]))
         account.last = now
 
 
@@ -99,7 +99,7 @@ def account(element: str, steps: int, motion: dict, friction=0.0, layers=False, 
         numerics={"element": element, "tolerance": 1e-8, "max_step_mm": 1.0, "edge_length_mm": None},
     )
     numerics, material = posed.numerics, pad_material(posed.sensor.gel, mesh)
-    ledger = Ledger(function_space(mesh, ELEMENT[element]()), material, penalty=numerics.penalty)
+    ledger = Ledger(function_space(mesh, ELEMENT[element]()), material)
     ledger.account = Account()
     path = Press.of(posed, mesh).path
     steps = LoadSteps(path, SIZE, friction > 0, numerics, STANDARD)

@@ -90,13 +90,14 @@ class Touch:
 def touch(friction: float, shape: str = "sphere", multipliers: bool = True, fresh: float = 0, element="p1p1") -> Touch:
     """The gel with random displacements and multipliers; a share `fresh` of the points was off before the step."""
     rng = np.random.default_rng(1)
-    body = system(MESH, 0.4999, penalty=PENALTY, element=ELEMENT[element]())
+    body = system(MESH, 0.4999, element=ELEMENT[element]())
     posed = scene(MESH.size_mm, indenter=INDENTERS[shape], motion={"depth_mm": 0.5})
     zero = body.zero()
     state = Unknowns(0.03 * rng.standard_normal(zero.u.shape), rng.standard_normal(zero.p.shape))
     state.u[body.space.held] = 0.0
     made = Touch(body, state, indenters(posed, 0.5), friction)
-    made.indenters.friction.assign(np.array([friction]))
+    made.indenters.friction.fill_(friction)
+    made.indenters.stiffness.fill_(PENALTY)
     local, contact = made.local, body.contact
     count = local.shape[:2]
     spread = 0.01 if friction == STICK else 0.15

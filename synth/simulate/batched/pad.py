@@ -88,6 +88,6 @@ def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = N
 def _away(scene: Scene) -> Indenters:
     ball = RigidBody(0, np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.eye(3), 1.0, np.zeros((1, 1, 1)), 1.0)
     path = LoadPath(scene.motion.model_copy(update={"depth_mm": -AWAY_MM}), ball)
-    packed = pack_indenter(path, 0.0)
+    packed = pack_indenter(path, 0.0, 1.0)
     place_indenter(packed, path.pose(0.0))
     return packed

@@ -43,8 +43,6 @@ from synth.simulate.tables import barrier_tables, bulk_tables, face_tables, noda
 
 INNER_ITERATIONS = 8
 """Krylov iterations of a cycle: a solve that ends within them waits for their end, on average half of them."""
-PENALTY = 1.0
-"""What kernels multiply `Indenters.sharpness` by, which here is a press's contact stiffness, E per mm."""
 
 
 class BatchedSolver:
@@ -169,7 +167,7 @@ class BatchedSolver:
         a = self._arrays
         if self._told(Order.RESTORE_STEP):
             self._launch(fields.copy_memory, a.points, a.mask, a.after_step, a.memory)
-        wp.copy(a.indenters.sharpness, a.stiffness)
+        wp.copy(a.indenters.stiffness, a.stiffness)
         if self._told(Order.RESTORE_STEP, Order.ACCEPT, Order.BEGIN):
             self._launch(fields.to_start, self._value_dim, a.mask, a.orders, a.numbers, a.fields)
         if self._told(Order.ACCEPT):
@@ -178,12 +176,12 @@ class BatchedSolver:
             where = (PATH_DERIVATIVE_STEP, a.step, self._single.row, a.fields)
             self._launch(fields.apply_predictor, self._value_dim, a.mask, *where)
         if self._told(Order.AUGMENT):
-            found = (a.indenters, a.gap, a.tangential, PENALTY, a.contact)
+            found = (a.indenters, a.gap, a.tangential, a.contact)
             self._launch(augment, a.points, a.mask, a.asked_share, *found)
 
     def _update_contact_history(self, u: wp.array, new_only: int) -> None:
         a = self._arrays
-        found = (self._faces, a.indenters, a.gap, a.tangential, PENALTY, new_only, a.contact)
+        found = (self._faces, a.indenters, a.gap, a.tangential, new_only, a.contact)
         self._launch(update_contact_history, a.points, u, a.mask, *found)
 
     def _evaluate(self) -> None:
@@ -195,7 +193,7 @@ class BatchedSolver:
         self._launch(bulk_residual, elements, *a.trial, mask, self._bulk, *a.forces, a.jacobian)
         if self._barrier is not None:
             self._launch(barrier_residual, elements, u, mask, self._barrier, a.forces.u, a.jacobian)
-        law, found = (self._faces, a.indenters, a.contact, PENALTY), (a.forces.u, a.gap, a.tangential, a.traction)
+        law, found = (self._faces, a.indenters, a.contact), (a.forces.u, a.gap, a.tangential, a.traction)
         self._launch(contact_residual, self._face_dim, u, mask, *law, *found)
         norms = (mask, a.residual, a.nodes, a.jacobian, a.gaps, row, a.fields)
         self._launch_blocks(reductions.residual_norms, reductions.BLOCK, *norms, a.seen)
@@ -209,7 +207,7 @@ class BatchedSolver:
         self._launch(store_bulk, elements, mask, *a.iterate, self._bulk, a.viscosity, a.stored)
         if self._barrier is not None:
             self._launch(find_inverting, elements, mask, u, self._barrier, a.inverting)
-        law, matrices = (self._faces, a.indenters, a.contact, PENALTY), (a.symmetric, a.remainder)
+        law, matrices = (self._faces, a.indenters, a.contact), (a.symmetric, a.remainder)
         self._launch(contact_stiffness, self._face_dim, u, mask, *law, np.inf, a.touching, *matrices)
         stored = (a.touching, self._faces.weight, *matrices, a.stored_contact)
         self._launch(store_contact, self._face_dim, mask, *stored)

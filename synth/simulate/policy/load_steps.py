@@ -55,7 +55,7 @@ class LoadSteps:
 
         The others are recorded as the path goes through them.
         """
-        self._path, self._size_mm, self._rubs, self._numerics, self._options = path, size_mm, rubs, numerics, options
+        self._path, self._size_mm, self._rubs, self.numerics, self._options = path, size_mm, rubs, numerics, options
         self._relaxed_tolerance = max(options.relaxed_tolerance, numerics.tolerance)
         limits = (numerics.tolerance, self._relaxed_tolerance, options.correction_iterations)
         self._passes = Passes(path, *limits, closer, patient=numerics.target_error_percent is not None)
@@ -93,11 +93,11 @@ class LoadSteps:
         """One step."""
         target = self.target()
         between = target in self._recorded or target not in self._waypoints
-        tolerance = self._relaxed_tolerance if between else self._numerics.tolerance
+        tolerance = self._relaxed_tolerance if between else self.numerics.tolerance
         start = yield from self._predict(target)
         solution = yield from solve(start, tolerance)
         self._count(solution.iterations)
-        relaxed = not solution.converged and target - self.at <= MAX_RELAXED_STEP * self._numerics.max_step_mm
+        relaxed = not solution.converged and target - self.at <= MAX_RELAXED_STEP * self.numerics.max_step_mm
         if relaxed:
             start = yield Begin(target)
             solution = yield from relax(start, tolerance)
@@ -150,7 +150,7 @@ class LoadSteps:
             if solution.converged and solution.at.deepest_mm > share * self._path.depth_scale_mm:
                 self._reason = too_deep(self._path.pose(target), share)
             else:
-                solution = yield from polish(solution, self._numerics.tolerance)
+                solution = yield from polish(solution, self.numerics.tolerance)
         self._count(solution.iterations - step.iterations)
         if solution.converged and not self._reason:
             yield Record(target, self.iterations, solution.at)
@@ -168,11 +168,11 @@ class LoadSteps:
         if target == self._waypoints[self.next]:
             self.next += 1
         if iterations <= MAX_ITERATIONS_TO_GROW:
-            self.step = min(self._numerics.max_step_mm, GROWTH * max(taken, self.step / GROWTH))
+            self.step = min(self.numerics.max_step_mm, GROWTH * max(taken, self.step / GROWTH))
 
     def _shorten(self, target: float, relaxed: bool) -> None:
         """After a failure: half the step, a quarter if it was relaxed; and the end if that is too short or late."""
         self.step = (target - self.at) / (4 if relaxed else 2)
         self._previous = None
-        if self.step < SHORTEST_STEP * self._numerics.max_step_mm or self.spent > MAX_PRESS_ITERATIONS:
+        if self.step < SHORTEST_STEP * self.numerics.max_step_mm or self.spent > MAX_PRESS_ITERATIONS:
             self._reason = not_converged(target - self.at, self._path.pose(self.at))
