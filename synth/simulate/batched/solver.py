@@ -185,13 +185,12 @@ class BatchedSolver:
         self._launch(bulk_residual, elements, *a.trial, mask, self._bulk, *a.forces, a.jacobian)
         if self._barrier is not None:
             self._launch(barrier_residual, elements, u, mask, self._barrier, a.forces.u, a.jacobian)
-        law, found = (self._faces, a.indenters, a.contact), (a.forces.u, a.gap, a.tangential, a.traction)
-        self._launch(contact_residual, self._face_dim, u, mask, *law, *found)
-        norms = (mask, a.residual, a.nodes, a.jacobian, a.gaps, row, a.fields)
-        self._launch_blocks(reductions.residual_norms, reductions.BLOCK, *norms, a.seen)
+        law, contact = (self._faces, a.indenters, a.contact), (a.forces.u, a.gap, a.tangential, a.traction)
+        self._launch(contact_residual, self._face_dim, u, mask, *law, *contact)
         self._launch(viscous_force, elements, mask, a.iterate.u, u, a.viscosity, self._bulk, a.viscous_forces.u)
-        moved = (a.residual, a.nodes, a.viscous, row, gmres.flat(a.krylov.basis), a.share, a.numbers)
-        self._launch_blocks(reductions.relaxation_errors, reductions.BLOCK, mask, *moved, a.seen)
+        found = (a.residual, a.viscous, a.nodes, a.jacobian, a.gaps, row, a.fields)
+        solve = (gmres.flat(a.krylov.basis), a.share, a.numbers)
+        self._launch_blocks(reductions.evaluations, reductions.BLOCK, mask, *found, *solve, a.seen)
 
     def _linearise(self) -> None:
         a = self._arrays
