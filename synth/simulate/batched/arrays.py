@@ -68,7 +68,7 @@ class BatchArrays:
         self.touching = zeros(self.points[:2], wp.int32)
         self.symmetric, self.remainder = zeros(self.points, wp.mat33d), zeros(self.points, wp.mat33d)
         self.stored_contact = zeros(self.points, wp.mat33f)
-        sizes = shapes(pad.preconditioner.rows, batch)
+        sizes = shapes(len(pad.inverse), batch)
         self.krylov: Krylov = zeros_of(Krylov, lambda name: sizes[name], device)
         self.step = flat(self.krylov.step)
 

@@ -55,7 +55,7 @@ class BatchedSolver:
     def __init__(self, pad: Pad, batch: int, records: int, grid: tuple[int, int, int], inner: int) -> None:
         space, material, device = pad.space, pad.material, pad.device
         self.pad, self.batch, self.device = pad, batch, device
-        rows = pad.preconditioner.rows
+        rows = len(pad.inverse)
         self._bulk, self._faces = bulk_tables(space, material, pad.mixed, device), face_tables(space, device)
         self.inner, self._table = inner, PressTable(batch, device)
         self._presses = self._table.on_device()
@@ -65,7 +65,7 @@ class BatchedSolver:
         self._surface = struct_of(reductions.SurfaceTables, device, **surface)
         self._product = bulk_product(space.nodes.shape[1], pad.mixed, space.element.stabilisation > 0, pad.yeoh)
         self._contact_product = contact_product(space.faces.shape[1])
-        self._transpose, self._block = pad.preconditioner.dense.transpose, gmres.block_size(rows)
+        self._block = gmres.block_size(rows)
         self._arnoldi, self._solution = gmres.arnoldi(rows), gmres.solution(rows)
         self._arrays = BatchArrays(pad, batch, records, grid)
         self.krylov = self._arrays.krylov
@@ -206,13 +206,17 @@ class BatchedSolver:
         self._launch(gmres.begin_solves, a.krylov.step.shape, mask, a.numbers, *right)
 
     def _iterate(self) -> None:
-        self.pad.preconditioner.apply(self.krylov)
+        self._precondition()
         self._multiply()
         self._launch_blocks(self._arnoldi, self._block, self.krylov)
 
+    def _precondition(self) -> None:
+        k = self.krylov
+        self.pad.dense.product(self.pad.inverse, gmres.flat(k.current), gmres.flat(k.preconditioned), k.running)
+
     def _multiply(self) -> None:
         """The tangent times the preconditioned vectors."""
-        a, k, elements, transpose = self._arrays, self.krylov, self._element_dim[::-1], self._transpose
+        a, k, elements, transpose = self._arrays, self.krylov, self._element_dim[::-1], self.pad.dense.transpose
         transpose(gmres.flat(k.preconditioned), k.corrected)
         k.image.zero_()
         found = (a.stored, k.corrected, k.image)
