@@ -22,7 +22,7 @@ from synth.press.press import Press
 from synth.simulate.batched import fields, lane_orders, reductions
 from synth.simulate.batched import krylov as gmres
 from synth.simulate.batched.arrays import BatchArrays, single_tables
-from synth.simulate.batched.lane_orders import PATH_DERIVATIVE_STEP, Order
+from synth.simulate.batched.lane_orders import Order
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.presses import PressTable, padded
 from synth.simulate.batched.product import (
@@ -160,13 +160,11 @@ class BatchedSolver:
         if self._told(Order.RESTORE_STEP):
             self._launch(fields.copy_memory, a.points, a.mask, a.after_step, a.memory)
         wp.copy(a.indenters.stiffness, a.stiffness)
-        if self._told(Order.RESTORE_STEP, Order.ACCEPT, Order.BEGIN):
-            self._launch(fields.to_start, self._value_dim, a.mask, a.orders, a.numbers, a.fields)
+        if self._told(Order.RESTORE_STEP, Order.ACCEPT, Order.BEGIN, Order.PREDICT):
+            step = (a.step, self._single.row, a.fields)
+            self._launch(fields.to_start, self._value_dim, a.mask, a.orders, a.numbers, *step)
         if self._told(Order.ACCEPT):
             self._update_contact_history(a.state.u, 0)
-        if self._told(Order.PREDICT):
-            where = (PATH_DERIVATIVE_STEP, a.step, self._single.row, a.fields)
-            self._launch(fields.apply_predictor, self._value_dim, a.mask, *where)
         if self._told(Order.AUGMENT):
             found = (a.indenters, a.gap, a.tangential, a.contact)
             self._launch(augment, a.points, a.mask, a.asked_share, *found)
