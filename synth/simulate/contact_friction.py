@@ -275,17 +275,17 @@ def contact_tangent(
     touching: wp.array2d(dtype=wp.int32),
     symmetric: wp.array3d(dtype=wp.mat33d),
     slot: wp.array3d(dtype=wp.int32),
-    values: wp.array2d(dtype=wp.float64),
+    values: wp.array(dtype=wp.float64),
 ):
-    """One thread per (sample, face, pair a <= b of its nodes); as `synth.simulate.stiffness.bulk_tangent`."""
-    s, f, k = wp.tid()
-    if touching[s, f] == 0:
+    """One thread per (face, pair a <= b of its nodes); as `synth.simulate.stiffness.bulk_tangent`."""
+    f, k = wp.tid()
+    if touching[0, f] == 0:
         return
     a = pairs[k][0]
     b = pairs[k][1]
     block = wp.mat33d()
     for q in range(faces.weight.shape[1]):
-        block += (faces.weight[f, q] * faces.shape[q, a] * faces.shape[q, b]) * symmetric[s, f, q]
+        block += (faces.weight[f, q] * faces.shape[q, a] * faces.shape[q, b]) * symmetric[0, f, q]
     for i in range(3):
         for j in range(3):
-            wp.atomic_add(values, s, slot[f, k, 3 * i + j], block[i, j])
+            wp.atomic_add(values, slot[f, k, 3 * i + j], block[i, j])

@@ -108,17 +108,14 @@ def barrier_residual(
 @wp.kernel
 def barrier_tangent(
     u: wp.array2d(dtype=wp.vec3d),
-    active: wp.array(dtype=wp.int32),
     barrier: BarrierTables,
     pairs: wp.array(dtype=wp.vec2i),
     slot: wp.array3d(dtype=wp.int32),
-    values: wp.array2d(dtype=wp.float64),
+    values: wp.array(dtype=wp.float64),
 ):
-    """One thread per (sample, element); adds to the sparse values as `synth.simulate.stiffness.bulk_tangent`."""
-    s, e = wp.tid()
-    if active[s] == 0:
-        return
-    F0, F1, F2, F3 = corner_gradients(barrier, u, s, e)
+    """One thread per element; adds to the sparse values as `synth.simulate.stiffness.bulk_tangent`."""
+    e = wp.tid()
+    F0, F1, F2, F3 = corner_gradients(barrier, u, 0, e)
     for p in range(barrier.at.shape[0]):
         at = barrier.at[p]
         F = at[0] * F0 + at[1] * F1 + at[2] * F2 + at[3] * F3
@@ -134,4 +131,4 @@ def barrier_tangent(
                 block = along * wp.outer(ha, hb) + across * wp.outer(hb, ha)
                 for i in range(3):
                     for j in range(3):
-                        wp.atomic_add(values, s, slot[e, k, 3 * i + j], block[i, j])
+                        wp.atomic_add(values, slot[e, k, 3 * i + j], block[i, j])

@@ -9,6 +9,7 @@ from collections import OrderedDict
 
 import numpy as np
 import scipy.sparse as sp
+import warp as wp
 
 from synth.simulate.linear import Factor, direct_factor
 from synth.simulate.space import Space
@@ -21,7 +22,8 @@ class SparsityPattern:
         free: (k,) unknowns that are not held.
         indptr, indices: (k + 1,), (nnz,) int32.
         element_pairs, face_pairs: (np, 2) int32, local nodes a <= b.
-        block_slot: (m, np, 9) int32 entry of each displacement block; nnz stands for "nowhere".
+        block_slot: (m, np, 9) entry of each displacement block, a Warp array of int32 on the CPU as all slots; nnz
+            stands for "nowhere".
         coupling_slot: (m, 4 nn, 3), pressure_slot: (m, 4, 4); without a pressure field (m, 0, 3) and (m, 0, 0).
         face_slot: (f, np', 9).
         face_unknowns: (f, 3 ns) number among the free unknowns, or -1.
@@ -41,13 +43,12 @@ class SparsityPattern:
         self.block_slot = self._blocks(moves, self.element_pairs)
         count = len(space.nodes)
         if pressures is None:
-            self.coupling_slot = np.zeros((count, 0, 3), dtype=np.int32)
-            self.pressure_slot = np.zeros((count, 0, 0), dtype=np.int32)
+            self.coupling_slot, self.pressure_slot = _on_cpu(np.zeros((count, 0, 3))), _on_cpu(np.zeros((count, 0, 0)))
         else:
             row, column = moves[:, :, None, :], pressures[:, None, :, None]
-            self.coupling_slot = self._slots(*np.broadcast_arrays(row, column)).reshape(count, -1, 3)
+            self.coupling_slot = _on_cpu(self._slots(*np.broadcast_arrays(row, column)).reshape(count, -1, 3))
             row, column = np.broadcast_arrays(pressures[:, :, None], pressures[:, None, :])
-            self.pressure_slot = np.where(row <= column, self._slots(row, column), self.size).astype(np.int32)
+            self.pressure_slot = _on_cpu(np.where(row <= column, self._slots(row, column), self.size))
         faces = number[(3 * space.faces[:, :, None].astype(np.int64) + np.arange(3))]
         self.face_pairs = _pairs(space.faces.shape[1])
         self.face_slot = self._blocks(faces, self.face_pairs)
@@ -83,12 +84,16 @@ class SparsityPattern:
         place = np.searchsorted(self._keys, first * len(self.free) + last)
         return np.where(first >= 0, place, self.size).astype(np.int32)
 
-    def _blocks(self, moves: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    def _blocks(self, moves: np.ndarray, pairs: np.ndarray) -> wp.array:
         row, column = moves[:, pairs[:, 0], :, None], moves[:, pairs[:, 1], None, :]
         row, column = np.broadcast_arrays(row, column)
         slots = self._slots(row, column)
         own = (pairs[:, 0] == pairs[:, 1])[None, :, None, None]
-        return np.where(own & (row > column), self.size, slots).astype(np.int32).reshape(len(moves), len(pairs), 9)
+        return _on_cpu(np.where(own & (row > column), self.size, slots).reshape(len(moves), len(pairs), 9))
+
+
+def _on_cpu(slots: np.ndarray) -> wp.array:
+    return wp.array(slots, dtype=wp.int32, device="cpu")
 
 
 def _pairs(count: int) -> np.ndarray:

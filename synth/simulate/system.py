@@ -105,9 +105,6 @@ class System:
         self._active = _array(np.ones(1), wp.int32)
         self._pairs = _array(self._pattern.element_pairs, wp.vec2i)
         self._face_pairs = _array(self._pattern.face_pairs, wp.vec2i)
-        slots = (self._pattern.block_slot, self._pattern.coupling_slot, self._pattern.pressure_slot)
-        self._block_slot, self._coupling_slot, self._pressure_slot = (_array(s, wp.int32) for s in slots)
-        self._face_slot = _array(self._pattern.face_slot, wp.int32)
         self._allocate()
 
     @property
@@ -128,7 +125,7 @@ class System:
         self._stiffness = _zeros(points, wp.mat33d)
         self._remainder = _zeros(points, wp.mat33d)
         self._touching = _zeros(points[:2], wp.int32)
-        at_points = (1, count, len(element.weights))
+        at_points = (count, len(element.weights))
         self._factor, self._held = _zeros(at_points, wp.vec4d), _zeros(at_points, wp.vec4d)
         at_nodes = (*at_points, self.space.nodes.shape[1])
         self._pushed, self._drift = _zeros(at_nodes, wp.vec3d), _zeros(at_nodes, wp.vec3d)
@@ -155,24 +152,23 @@ class System:
     def tangent(self, state: Unknowns, indenter: Indenters, viscosity: float = 0.0, turn: float = np.inf) -> Tangent:
         """Derivative of the free residual, plus viscosity times `viscous_force`'s; turn: `contact_stiffness`'s most."""
         u, p = _on_device(state)
-        active, elements = self._active, (1, len(self.space.nodes))
-        thick = _array(np.array([viscosity]), wp.float64)
+        elements, pattern = (len(self.space.nodes),), self._pattern
         factor, held, pushed, drift = self._factor, self._held, self._pushed, self._drift
-        values = _zeros((1, self._pattern.size + 1), wp.float64)
-        _launch(linearise, elements, u, p, active, self._bulk, factor, held, pushed, drift)
-        bulk = [active, self._bulk, self._laplace, thick, factor, pushed, drift, self._block_slot]
+        values = _zeros((pattern.size + 1,), wp.float64)
+        _launch(linearise, elements, u, p, self._bulk, factor, held, pushed, drift)
+        bulk = [self._bulk, self._laplace, viscosity, factor, pushed, drift, pattern.block_slot]
         _launch(bulk_tangent, elements, *bulk, values)
         if self._barrier is not None:
-            _launch(barrier_tangent, elements, u, active, self._barrier, self._pairs, self._block_slot, values)
+            _launch(barrier_tangent, elements, u, self._barrier, self._pairs, pattern.block_slot, values)
         if self.mixed:
-            slots = [self._coupling_slot, self._pressure_slot]
-            _launch(pressure_tangent, elements, active, self._bulk, held, pushed, *slots, values)
-        contact = [u, active, self._faces, indenter, self.contact]
+            slots = [pattern.coupling_slot, pattern.pressure_slot]
+            _launch(pressure_tangent, elements, self._bulk, held, pushed, *slots, values)
+        contact = [u, self._active, self._faces, indenter, self.contact]
         faces, touching, remainder = self._points[:2], self._touching, self._remainder
         _launch(contact_stiffness, faces, *contact, turn, touching, self._stiffness, remainder)
-        blocks = [self._faces, self._face_pairs, touching, self._stiffness, self._face_slot]
-        _launch(contact_tangent, (*faces, len(self._pattern.face_pairs)), *blocks, values)
-        return Tangent(values.numpy()[0, :-1], self._unsymmetric(touching.numpy()[0], remainder.numpy()[0]))
+        blocks = [self._faces, self._face_pairs, touching, self._stiffness, pattern.face_slot]
+        _launch(contact_tangent, (faces[1], len(pattern.face_pairs)), *blocks, values)
+        return Tangent(values.numpy()[:-1], self._unsymmetric(touching.numpy()[0], remainder.numpy()[0]))
 
     def viscous_force(self, before: Unknowns, after: Unknowns, viscosity: float) -> FloatArray:
         """(k,) force on the free unknowns against a step with a viscosity, see `synth.simulate.policy.newton`."""

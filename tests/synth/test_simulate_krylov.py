@@ -23,9 +23,7 @@ from synth.simulate.policy.requests import Solve
 def _systems(batch: int, device: str = "cpu", residual: np.ndarray | None = None) -> Krylov:
     """Lanes at the start of a linear solve, for residuals (batch, 150) that are told to be of norm 1."""
     rows = padded(150)
-    krylov, sizes = Krylov(), kernels.shapes(rows, batch)
-    for name, variable in Krylov.vars.items():
-        setattr(krylov, name, wp.zeros(sizes[name], dtype=variable.type.dtype, device=device))
+    krylov = kernels.waiting(rows, batch, device)
     residual = np.zeros((batch, 150)) if residual is None else residual
     numbers = np.zeros((batch, len(Number)))
     numbers[:, [Number.NORM, Number.GOAL]] = 1.0, 1e-3

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from synth.simulate.batched.fields import ContactMemory, Fields
-from synth.simulate.batched.krylov import Krylov, flat, shapes
+from synth.simulate.batched.krylov import Krylov, flat, waiting
 from synth.simulate.batched.lane_orders import Number, Seen
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.product import STORED, STORED_YEOH, SingleTables
@@ -68,8 +68,7 @@ class BatchArrays:
         self.touching = zeros(self.points[:2], wp.int32)
         self.symmetric, self.remainder = zeros(self.points, wp.mat33d), zeros(self.points, wp.mat33d)
         self.stored_contact = zeros(self.points, wp.mat33f)
-        sizes = shapes(pad.preconditioner.rows, batch)
-        self.krylov: Krylov = zeros_of(Krylov, lambda name: sizes[name], device)
+        self.krylov: Krylov = waiting(len(pad.inverse), batch, device)
         self.step = flat(self.krylov.step)
 
 

@@ -3,6 +3,10 @@
 import warp as wp
 
 from synth.simulate.batched.lane_orders import Number, Order
+from synth.simulate.policy.requests import PATH_DERIVATIVE_STEP
+
+PATH_DERIVATIVES = wp.constant(wp.float64(1.0 / PATH_DERIVATIVE_STEP))
+"""The rigid-motion predictor's step over the one that was solved for."""
 
 
 @wp.struct
@@ -55,24 +59,6 @@ def compute_trial(
 
 
 @wp.kernel
-def apply_predictor(
-    mask: wp.array(dtype=wp.int32),
-    share: wp.float64,
-    step: wp.array2d(dtype=wp.float32),
-    row: wp.array(dtype=wp.int32),
-    fields: Fields,
-):
-    """One thread per (lane, value): the first iterate, the state and 1/share times step."""
-    s, i = wp.tid()
-    if mask[s] == 0:
-        return
-    x = fields.state[s, i]
-    if row[i] >= 0:
-        x += (wp.float64(1.0) / share) * wp.float64(step[s, row[i]])
-    fields.iterate[s, i] = x
-
-
-@wp.kernel
 def to_solution(mask: wp.array(dtype=wp.int32), orders: wp.array(dtype=wp.int32), fields: Fields):
     """One thread per (lane, value): the iterate that a solve has ended with, and snapshots of it."""
     s, i = wp.tid()
@@ -96,9 +82,14 @@ def to_start(
     mask: wp.array(dtype=wp.int32),
     orders: wp.array(dtype=wp.int32),
     numbers: wp.array2d(dtype=wp.float64),
+    step: wp.array2d(dtype=wp.float32),
+    row: wp.array(dtype=wp.int32),
     fields: Fields,
 ):
-    """One thread per (lane, value): the end of a step is accepted, and the next one begins."""
+    """One thread per (lane, value): the end of a step is accepted, and the next one begins.
+
+    step, row: the rigid-motion predictor's, as for `compute_trial`.
+    """
     s, i = wp.tid()
     if mask[s] == 0:
         return
@@ -114,6 +105,10 @@ def to_start(
         x = fields.state[s, i]
         if ratio != wp.float64(0.0):
             x += ratio * (x - fields.previous[s, i])
+    if (order & Order.PREDICT) != 0:
+        x = fields.state[s, i]
+        if row[i] >= 0:
+            x += PATH_DERIVATIVES * wp.float64(step[s, row[i]])
     fields.iterate[s, i] = x
 
 

@@ -22,6 +22,7 @@ import warp as wp
 
 from synth.simulate.batched.lane_orders import Number, Order, Seen
 from synth.simulate.linear import GMRES_LIMIT
+from synth.simulate.tables import zeros_of
 
 WAITING, RUNNING, DONE = wp.constant(0), wp.constant(1), wp.constant(2)
 LIMIT = wp.constant(GMRES_LIMIT)
@@ -69,16 +70,17 @@ class Krylov:
     step: wp.array2d(dtype=wp.vec4f)
 
 
-def shapes(rows: int, batch: int) -> dict[str, tuple[int, ...]]:
-    """Of a Krylov's arrays, by name."""
+def waiting(rows: int, batch: int, device: str) -> Krylov:
+    """So many lanes that wait, for vectors of so many rows."""
     lanes, turned, each, limit = (batch,), (rows, batch), (batch, rows // 4), GMRES_LIMIT
-    return {
+    shapes = {
         "running": lanes, "k": lanes, "size": lanes, "goal": lanes,
         "basis": (batch, limit + 1, rows // 4), "corrections": (batch, limit, rows // 4),
         "current": each, "preconditioned": each, "corrected": turned, "image": turned, "product": each,
         "triangle": (batch, limit, limit), "cosine": (batch, limit), "sine": (batch, limit),
         "residual": (batch, limit + 1), "step": each,
     }  # fmt: skip
+    return zeros_of(Krylov, lambda name: shapes[name], device)
 
 
 def flat(vectors: wp.array) -> wp.array:

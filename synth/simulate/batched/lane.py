@@ -7,7 +7,7 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.press.press import Press
-from synth.simulate.batched.lane_orders import PATH_DERIVATIVE_STEP, Number, Order, Seen
+from synth.simulate.batched.lane_orders import Number, Order, Seen
 from synth.simulate.linear import GMRES_TOLERANCE
 from synth.simulate.policy import requests as ask
 from synth.simulate.policy.load_steps import LoadSteps
@@ -97,7 +97,7 @@ class Lane:
                 numbers[Number.RATIO] = request.ratio
                 start = Order.BEGIN
                 if request.rigid:
-                    numbers[Number.AT] = at + PATH_DERIVATIVE_STEP * (target - at)
+                    numbers[Number.AT] = at + ask.PATH_DERIVATIVE_STEP * (target - at)
                     seen = yield order | Order.BEGIN | Order.STICKING | Order.EVALUATE
                     numbers[Number.AT], numbers[Number.VISCOSITY], numbers[Number.NORM] = at, 0.0, seen[Seen.FREE]
                     numbers[Number.GOAL] = min(GMRES_TOLERANCE, self._forcing)

@@ -82,7 +82,6 @@ def select(orders: wp.array(dtype=wp.int32), wanted: int, mask: wp.array(dtype=w
 
 
 STICK_FRICTION = wp.constant(wp.float64(requests.STICK_FRICTION))
-PATH_DERIVATIVE_STEP = requests.PATH_DERIVATIVE_STEP
 
 
 @wp.func

@@ -19,7 +19,6 @@ from synth.press.load_path import LoadPath
 from synth.press.resolution import ELEMENTS
 from synth.scene import Scene
 from synth.simulate.batched.gpu import Dense, dense, inverse
-from synth.simulate.batched.krylov import Krylov, flat
 from synth.simulate.contact_friction import Indenters
 from synth.simulate.material import Material, pad_material
 from synth.simulate.space import Space, function_space
@@ -34,32 +33,25 @@ def stiffness(system: System, away: Indenters) -> scipy.sparse.csr_array:
     return upper + scipy.sparse.triu(upper, 1).T
 
 
-class Preconditioner:
-    """K_0^{-1} on a device, of `inverse`."""
-
-    def __init__(self, matrix: wp.array, products: Dense | None = None) -> None:
-        self.matrix, self.rows = matrix, matrix.shape[0]
-        self.dense = products or dense(str(matrix.device))
-
-    def apply(self, krylov: Krylov) -> None:
-        """`preconditioned` = K_0^{-1} `current`, at least where a solve is running."""
-        given, found = flat(krylov.current), flat(krylov.preconditioned)
-        self.dense.product(self.matrix, given, found, krylov.running)
-
-
 AWAY_MM = 1e3
 """Where an indenter touches nothing."""
 
 
 @dataclass(frozen=True)
 class Pad:
-    """The pad of a batch, prepared for a scene; free: (k,) numbers of the unknowns not held, displacements first."""
+    """The pad of a batch, prepared for a scene.
+
+    Attributes:
+        free: (k,) numbers of the unknowns not held, displacements first.
+        inverse: (rows, rows) K_0^{-1} on the device, of `synth.simulate.batched.gpu.inverse`; `dense` applies it.
+    """
 
     scene: Scene
     space: Space
     material: Material
     free: np.ndarray
-    preconditioner: Preconditioner
+    inverse: wp.array
+    dense: Dense
     device: str
 
     @property
@@ -81,8 +73,8 @@ def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = N
     material = pad_material(scene.sensor.gel, mesh)
     space = function_space(mesh, ELEMENTS[scene.numerics.element]())
     system = System(space, material)
-    preconditioner = Preconditioner(inverse(stiffness(system, _away(scene)), device), products)
-    return Pad(scene, space, material, system.free, preconditioner, device)
+    matrix = inverse(stiffness(system, _away(scene)), device)
+    return Pad(scene, space, material, system.free, matrix, products or dense(device), device)
 
 
 def _away(scene: Scene) -> Indenters:

@@ -24,49 +24,64 @@ class SurfaceTables:
 
 
 @wp.kernel
-def residual_norms(
+def evaluations(
     mask: wp.array(dtype=wp.int32),
     residual: wp.array2d(dtype=wp.float64),
+    viscous: wp.array2d(dtype=wp.float64),
     nodes: int,
     jacobian: wp.array2d(dtype=wp.float64),
     gap: wp.array2d(dtype=wp.float64),
     row: wp.array(dtype=wp.int32),
     fields: Fields,
+    right: wp.array2d(dtype=wp.float32),
+    share: wp.array(dtype=wp.float64),
+    numbers: wp.array2d(dtype=wp.float64),
     seen: wp.array2d(dtype=wp.float64),
 ):
-    """One block per lane: what an Evaluation holds but for the error, see `synth.simulate.policy.requests`.
+    """One block per lane: what an Evaluation holds, see `synth.simulate.policy.requests`.
 
-    gap: (B, points); row: of each value in Krylov vectors, -1 where it is held.
+    Its error is the norm of r(u + t δ) - (1 - t) r(u) + t θ L δ over that of r(u). gap: (B, points); row: of each value
+    in Krylov vectors, -1 where it is held; right: (B, at least rows), first -r(u) over its norm, the linear solve's
+    right side.
     """
     s, thread = wp.tid()
     if mask[s] == 0:
         return
+    left = (wp.float64(1.0) - share[s]) * numbers[s, Number.NORM]
     free = wp.float64(0.0)
     whole = wp.float64(0.0)
     held = wp.float64(0.0)
+    missed = wp.float64(0.0)
     smallest = wp.float64(1.0e30)
     farthest = wp.float64(0.0)
     deepest = wp.float64(0.0)
     for i in range(thread, nodes, wp.block_dim()):
         moved = node_value(fields.trial, s, i) - node_value(fields.before_pass, s, i)
         farthest = wp.max(farthest, wp.length_sq(moved))
-        square = wp.length_sq(node_value(residual, s, i))
+        force = node_value(residual, s, i)
+        square = wp.length_sq(force)
         whole += square
-        if row[3 * i] >= 0:
+        first = row[3 * i]
+        if first >= 0:
             free += square
+            before = wp.vec3d(wp.vec3f(right[s, first], right[s, first + 1], right[s, first + 2]))
+            missed += wp.length_sq(force + node_value(viscous, s, i) + left * before)
         else:
             held += square
     for i in range(3 * nodes + thread, residual.shape[1], wp.block_dim()):
         free += residual[s, i] * residual[s, i]
+        rest = residual[s, i] + left * wp.float64(right[s, row[i]])
+        missed += rest * rest
     for i in range(thread, jacobian.shape[1], wp.block_dim()):
         smallest = wp.min(smallest, jacobian[s, i])
     for i in range(thread, gap.shape[1], wp.block_dim()):
         deepest = wp.max(deepest, -gap[s, i])
     free = wp.tile_extract(wp.tile_sum(wp.tile(free)), 0)
     whole = wp.tile_extract(wp.tile_sum(wp.tile(whole)), 0)
+    held = wp.tile_extract(wp.tile_sum(wp.tile(held)), 0)
+    missed = wp.tile_extract(wp.tile_sum(wp.tile(missed)), 0)
     smallest = wp.tile_extract(wp.tile_min(wp.tile(smallest)), 0)
     farthest = wp.tile_extract(wp.tile_max(wp.tile(farthest)), 0)
-    held = wp.tile_extract(wp.tile_sum(wp.tile(held)), 0)
     deepest = wp.tile_extract(wp.tile_max(wp.tile(deepest)), 0)
     if thread == 0:
         seen[s, Seen.FREE] = wp.sqrt(free)
@@ -75,40 +90,7 @@ def residual_norms(
         seen[s, Seen.JACOBIAN] = smallest
         seen[s, Seen.MOVED] = wp.sqrt(farthest)
         seen[s, Seen.DEEPEST] = deepest
-
-
-@wp.kernel
-def relaxation_errors(
-    mask: wp.array(dtype=wp.int32),
-    residual: wp.array2d(dtype=wp.float64),
-    nodes: int,
-    viscous: wp.array2d(dtype=wp.float64),
-    row: wp.array(dtype=wp.int32),
-    right: wp.array2d(dtype=wp.float32),
-    share: wp.array(dtype=wp.float64),
-    numbers: wp.array2d(dtype=wp.float64),
-    seen: wp.array2d(dtype=wp.float64),
-):
-    """One block per lane: the norm of r(u + t δ) - (1 - t) r(u) + t θ L δ over that of r(u), where a lane relaxes.
-
-    right: (B, at least rows), first -r(u) over its norm, the linear solve's right side.
-    """
-    s, thread = wp.tid()
-    if mask[s] == 0:
-        return
-    left = (wp.float64(1.0) - share[s]) * numbers[s, Number.NORM]
-    total = wp.float64(0.0)
-    for i in range(thread, nodes, wp.block_dim()):
-        first = row[3 * i]
-        if first >= 0:
-            before = wp.vec3d(wp.vec3f(right[s, first], right[s, first + 1], right[s, first + 2]))
-            total += wp.length_sq(node_value(residual, s, i) + node_value(viscous, s, i) + left * before)
-    for i in range(3 * nodes + thread, residual.shape[1], wp.block_dim()):
-        rest = residual[s, i] + left * wp.float64(right[s, row[i]])
-        total += rest * rest
-    total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
-    if thread == 0:
-        seen[s, Seen.ERROR] = wp.sqrt(total) / numbers[s, Number.NORM]
+        seen[s, Seen.ERROR] = wp.sqrt(missed) / numbers[s, Number.NORM]
 
 
 @wp.kernel

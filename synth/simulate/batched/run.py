@@ -152,16 +152,9 @@ class Run:
             untouched.append((number, Trajectory(rest, "", 0.0, self._pad.space)))
 
     def _steps(self, press: Press, wanted: frozenset[int] | None) -> LoadSteps:
-        scene, mesh = press.scene, press.mesh
-        return LoadSteps(
-            press.path,
-            mesh.size_mm,
-            scene.contact.friction > 0,
-            scene.numerics,
-            self._options,
-            wanted,
-            self._options.closer,
-        )
+        scene, options = press.scene, self._options
+        given = (press.mesh.size_mm, scene.contact.friction > 0, scene.numerics, options)
+        return LoadSteps(press.path, *given, wanted, options.closer)
 
 
 def _room(press: Press) -> tuple[int, ...]:

@@ -22,7 +22,7 @@ from synth.press.press import Press
 from synth.simulate.batched import fields, lane_orders, reductions
 from synth.simulate.batched import krylov as gmres
 from synth.simulate.batched.arrays import BatchArrays, single_tables
-from synth.simulate.batched.lane_orders import PATH_DERIVATIVE_STEP, Order
+from synth.simulate.batched.lane_orders import Order
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.presses import PressTable, padded
 from synth.simulate.batched.product import (
@@ -54,7 +54,7 @@ class BatchedSolver:
     def __init__(self, pad: Pad, batch: int, records: int, grid: tuple[int, int, int]) -> None:
         space, material, device = pad.space, pad.material, pad.device
         self.pad, self.batch, self.device = pad, batch, device
-        rows = pad.preconditioner.rows
+        rows = len(pad.inverse)
         self._bulk, self._faces = bulk_tables(space, material, pad.mixed, device), face_tables(space, device)
         self._table = PressTable(batch, device)
         self._presses = self._table.on_device()
@@ -64,7 +64,7 @@ class BatchedSolver:
         self._surface = struct_of(reductions.SurfaceTables, device, **surface)
         self._product = bulk_product(space.nodes.shape[1], pad.mixed, space.element.stabilisation > 0, pad.yeoh)
         self._contact_product = contact_product(space.faces.shape[1])
-        self._transpose, self._block = pad.preconditioner.dense.transpose, gmres.block_size(rows)
+        self._block = gmres.block_size(rows)
         self._arnoldi, self._solution = gmres.arnoldi(rows), gmres.solution(rows)
         self._arrays = BatchArrays(pad, batch, records, grid)
         self.krylov = self._arrays.krylov
@@ -168,13 +168,11 @@ class BatchedSolver:
         if self._told(Order.RESTORE_STEP):
             self._launch(fields.copy_memory, a.points, a.mask, a.after_step, a.memory)
         wp.copy(a.indenters.stiffness, a.stiffness)
-        if self._told(Order.RESTORE_STEP, Order.ACCEPT, Order.BEGIN):
-            self._launch(fields.to_start, self._value_dim, a.mask, a.orders, a.numbers, a.fields)
+        if self._told(Order.RESTORE_STEP, Order.ACCEPT, Order.BEGIN, Order.PREDICT):
+            step = (a.step, self._single.row, a.fields)
+            self._launch(fields.to_start, self._value_dim, a.mask, a.orders, a.numbers, *step)
         if self._told(Order.ACCEPT):
             self._update_contact_history(a.state.u, 0)
-        if self._told(Order.PREDICT):
-            where = (PATH_DERIVATIVE_STEP, a.step, self._single.row, a.fields)
-            self._launch(fields.apply_predictor, self._value_dim, a.mask, *where)
         if self._told(Order.AUGMENT):
             found = (a.indenters, a.gap, a.tangential, a.contact)
             self._launch(augment, a.points, a.mask, a.asked_share, *found)
@@ -193,13 +191,12 @@ class BatchedSolver:
         self._launch(bulk_residual, elements, *a.trial, mask, self._bulk, *a.forces, a.jacobian)
         if self._barrier is not None:
             self._launch(barrier_residual, elements, u, mask, self._barrier, a.forces.u, a.jacobian)
-        law, found = (self._faces, a.indenters, a.contact), (a.forces.u, a.gap, a.tangential, a.traction)
-        self._launch(contact_residual, self._face_dim, u, mask, *law, *found)
-        norms = (mask, a.residual, a.nodes, a.jacobian, a.gaps, row, a.fields)
-        self._launch_blocks(reductions.residual_norms, reductions.BLOCK, *norms, a.seen)
+        law, contact = (self._faces, a.indenters, a.contact), (a.forces.u, a.gap, a.tangential, a.traction)
+        self._launch(contact_residual, self._face_dim, u, mask, *law, *contact)
         self._launch(viscous_force, elements, mask, a.iterate.u, u, a.viscosity, self._bulk, a.viscous_forces.u)
-        moved = (a.residual, a.nodes, a.viscous, row, gmres.flat(a.krylov.basis), a.share, a.numbers)
-        self._launch_blocks(reductions.relaxation_errors, reductions.BLOCK, mask, *moved, a.seen)
+        found = (a.residual, a.viscous, a.nodes, a.jacobian, a.gaps, row, a.fields)
+        solve = (gmres.flat(a.krylov.basis), a.share, a.numbers)
+        self._launch_blocks(reductions.evaluations, reductions.BLOCK, mask, *found, *solve, a.seen)
 
     def _linearise(self) -> None:
         a = self._arrays
@@ -215,13 +212,17 @@ class BatchedSolver:
         self._launch(gmres.begin_solves, a.krylov.step.shape, mask, a.numbers, *right)
 
     def _iterate(self) -> None:
-        self.pad.preconditioner.apply(self.krylov)
+        self._precondition()
         self._multiply()
         self._launch_blocks(self._arnoldi, self._block, self.krylov)
 
+    def _precondition(self) -> None:
+        k = self.krylov
+        self.pad.dense.product(self.pad.inverse, gmres.flat(k.current), gmres.flat(k.preconditioned), k.running)
+
     def _multiply(self) -> None:
         """The tangent times the preconditioned vectors."""
-        a, k, elements, transpose = self._arrays, self.krylov, self._element_dim[::-1], self._transpose
+        a, k, elements, transpose = self._arrays, self.krylov, self._element_dim[::-1], self.pad.dense.transpose
         transpose(gmres.flat(k.preconditioned), k.corrected)
         k.image.zero_()
         found = (a.stored, k.corrected, k.image)
