@@ -28,7 +28,7 @@ from synth.flow.exact import exact_flow
 from synth.flow.view import View
 from synth.mesh import PadMesh
 from synth.optics import Optics
-from synth.press.press import MeshRule, Press
+from synth.press.press import Press
 from synth.press.resolution import shared_mesh
 from synth.sampling import draw, samples_of
 from synth.scene import Scene
@@ -70,7 +70,7 @@ def drawn_of(template: Template, count: int, seed: int) -> list[Drawn]:
         InputError: none of them can be used; draws of different pads.
     """
     first = template.corners[0]
-    mesh = shared_mesh(first.sensor.gel, MeshRule.of(first, True).cells)
+    mesh = shared_mesh(first.sensor.gel, first.numerics)
     found: list[Drawn] = []
     for number in range(count):
         try:

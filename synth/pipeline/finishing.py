@@ -81,7 +81,7 @@ def _warning(context: JobContext, sample: Sample, view: View, frame: Frame) -> s
 
 
 def _diagnostics(context: JobContext, simulated: SimulatedTrajectory) -> dict[str, Any]:
-    found = simulated.accuracy or accuracy(simulated.scene, context.plan.mesh.cells, context.plan.template.folder)
+    found = simulated.accuracy or accuracy(simulated.scene, context.plan.template.folder)
     errors = {"predicted_error_px": found.error_px, "predicted_error_percent": found.error_percent}
     predicted = {name: None if np.isnan(error) else round(error, 4) for name, error in errors.items()}
     radius, is_mesh = simulated.path.body.fillet_mm, isinstance(simulated.scene.contact.indenter, MeshIndenter)

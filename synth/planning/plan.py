@@ -1,8 +1,7 @@
 """What a scene needs, decided once; what comes later is handed the plan and asks nothing again."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,7 +10,6 @@ from synth.mesh import edge_length, face_of
 from synth.mesh.cad import CadFace
 from synth.press.indenter import object_triangles, rigid_body
 from synth.press.press import MeshRule
-from synth.press.resolution import shared_cells
 from synth.press.scene_path import path_of
 from synth.render.camera_rays import pinhole
 from synth.render.coating import is_separated
@@ -20,13 +18,10 @@ from synth.render.pattern import check_pattern
 from synth.render.rest_map import read_rest_map
 from synth.render.thin_lens import check_views
 from synth.render.variant import Variant, always_grey, job_variant
-from synth.sampling import check_pairs, draw
-from synth.scene import MeshIndenter, Scene
+from synth.sampling import check_pairs
+from synth.scene import MeshIndenter
 from synth.scene.template import Template, load_scene
 from synth.simulate.material import DISPLACEMENT_ONLY_BELOW
-
-DRAWS, OBJECT_DRAWS = 24, 4
-"""Draws by which a shared mesh is chosen."""
 
 
 @dataclass(frozen=True)
@@ -132,18 +127,7 @@ def plan(scene: Template | str | Path, variant: Variant | None = None) -> Plan:
     suits = variant.is_on_gpu and not any(corner.motion.poses for corner in scene.corners) and not _own_pads(scene)
     batched = scene.numerics.solver == "batched" or (scene.numerics.solver == "auto" and suits)
     rules = [MeshRule.of(corner, batched) for corner in scene.corners]
-    rule = max(rules, key=lambda rule: rule.kind == "tetwild")
-    if rule.kind == "even" and scene.numerics.cells is None:
-        rule = replace(rule, cells=shared_cells(_draws(scene), rule.target_error_px, scene.folder))
-    return Plan(scene, variant, batched, rule)
-
-
-def _draws(template: Template) -> Iterator[Scene]:
-    """Some draws of a scene, by which its shared mesh is chosen; fewer of objects, whose bodies take longer."""
-    has_objects = any(isinstance(corner.contact.indenter, MeshIndenter) for corner in template.corners)
-    for trajectory in range(OBJECT_DRAWS if has_objects else DRAWS):
-        with suppress(InputError):
-            yield draw(template, 0, trajectory)
+    return Plan(scene, variant, batched, max(rules, key=lambda rule: rule.kind == "tetwild"))
 
 
 def check_buildable(template: Template, variant: Variant) -> None:

@@ -186,7 +186,7 @@ def _meshes(plan: Plan) -> _Meshes:
     spacings = [resolution.spacing_mm for _, resolution in found]
     text = f"{min(across)} to {max(across)} elements across the contact, {min(spacings):.2g} to {max(spacings):.2g} mm"
     if plan.mesh.kind == "even":
-        text = " x ".join(map(str, plan.mesh.cells)) + f" elements for all trajectories of a pad, {text}"
+        text = " x ".join(map(str, template.numerics.cells)) + f" elements for all trajectories of a pad, {text}"
     radii = [edge_radius_mm(scene, resolution.mesh) for scene, resolution in found]
     rounded = [radius for radius in radii if radius is not None]
     if rounded:

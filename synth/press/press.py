@@ -10,10 +10,8 @@ from synth.mesh import PadMesh, edge_length, pad_mesh
 from synth.press.indenter import RigidBody, object_radius
 from synth.press.load_path import LoadPath
 from synth.press.resolution import (
-    CELLS,
     FINER,
     Accuracy,
-    Cells,
     Resolution,
     accuracy,
     resolution_mm,
@@ -87,8 +85,8 @@ DEFAULT_TARGET_PX = 0.5
 class MeshRule:
     """How the meshes of a scene's trajectories are chosen: decided here, once, from the scene's numerics.
 
-    "graded": around each contact, as fine as the target asks for; "even": of `cells`, the same for all trajectories of
-    a pad; "tetwild": by fTetWild, also the same for all: round gels, and others where
+    "graded": around each contact, as fine as the target asks for; "even": `numerics.cells`, the same for all
+    trajectories of a pad; "tetwild": by fTetWild, also the same for all: round gels, and others where
     `numerics.edge_length_mm` is given. The targets are the root-mean-square error of the flow that the simulation may
     leave, NaN for "tetwild", for which nothing is predicted, and the error of force and displacement, if one is set.
     """
@@ -96,7 +94,6 @@ class MeshRule:
     kind: Literal["graded", "even", "tetwild"]
     target_error_px: float
     target_error_percent: float | None = None
-    cells: Cells = CELLS[0]
 
     @classmethod
     def of(cls, scene: Scene, is_batched: bool = False) -> "MeshRule":
@@ -105,8 +102,7 @@ class MeshRule:
         if numerics.edge_length_mm is not None or isinstance(scene.sensor.gel, RoundGel):
             return cls("tetwild", float("nan"))
         kind: Literal["even", "graded"] = "even" if is_batched else "graded"
-        target = numerics.target_error_px or DEFAULT_TARGET_PX
-        return cls(kind, target, numerics.target_error_percent, numerics.cells or CELLS[0])
+        return cls(kind, numerics.target_error_px or DEFAULT_TARGET_PX, numerics.target_error_percent)
 
     def resolution(
         self, scene: Scene, folder: Path | None = None, mesh_folders: Sequence[Path] | None = None
@@ -120,9 +116,9 @@ class MeshRule:
             case "graded":
                 return resolve(scene, folder, self.target_error_px, self.target_error_percent)
             case "even":
-                found, cells = accuracy(scene, self.cells, folder), self.cells
-                mesh, spacing = shared_mesh(gel, cells), shared_spacing_mm(gel, cells)
-                return Resolution(**vars(found), mesh=mesh, through=cells[2], spacing_mm=spacing)
+                found = accuracy(scene, folder)
+                mesh, spacing = shared_mesh(gel, numerics), shared_spacing_mm(gel, numerics)
+                return Resolution(**vars(found), mesh=mesh, through=numerics.cells[2], spacing_mm=spacing)
             case "tetwild":
                 mesh = pad_mesh(gel, numerics, mesh_folders, folder)
                 return Resolution(0, float("nan"), float("nan"), mesh, 0, edge_length(gel, numerics))
@@ -134,7 +130,7 @@ class MeshRule:
             return
         finer = {
             "graded": f"which has {FINER[-1]} elements across the contact, the most there are",
-            "even": f"make numerics.cells, here {list(self.cells)}, finer",
+            "even": "make numerics.cells finer",
             "tetwild": f"give numerics.edge_length_mm = {mesh.spacing_mm * stated / least:.2g}",
         }
         raise InputError(
@@ -146,7 +142,7 @@ class MeshRule:
     def lost_detail(self, scene: Scene, body: RigidBody, accuracy: Accuracy | None) -> str:
         """A warning that rounding changes what can be seen of an object, with the setting that keeps it; or nothing."""
         scale, radius = scale_px_per_mm(scene), body.fillet_mm
-        indenter, cells = scene.contact.indenter, self.cells
+        indenter, cells = scene.contact.indenter, scene.numerics.cells
         if not isinstance(indenter, MeshIndenter) or indenter.fillet_mm or body.lost_mm * scale < SEEN_PX:
             return ""
         finer = 2.0  # so many times the elements across
@@ -172,7 +168,7 @@ class MeshRule:
         The accuracy of an even mesh is left out: whoever finishes the samples predicts it, beside the simulation.
         """
         if self.kind == "even":
-            mesh = shared_mesh(scene.sensor.gel, self.cells)
+            mesh = shared_mesh(scene.sensor.gel, scene.numerics)
             self.check_edges(scene, mesh)
             return Press.of(scene, mesh, folder)
         found = self.resolution(scene, folder, mesh_folders)

@@ -7,21 +7,19 @@ the predictions (`synth.press.error_model`) were calibrated, and are tested, aga
 (docs/reports/budget.md).
 
 Draws of a pad that are simulated many at once share one mesh, wherever their indenters touch: it is even along x and y,
-and graded through the thickness so that elements at the contact face are about as high as wide. `numerics.cells` says
-how fine, else the target: see `shared_cells`. Each trajectory has a predicted error of its own, calibrated on meshes
-graded around the contact: it extrapolates.
+`numerics.cells` says how fine, and graded through the thickness so that elements at the contact face are about as high
+as wide. Each trajectory has a predicted error of its own, calibrated on meshes graded around the contact: it
+extrapolates.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
-from synth.errors import InputError
 from synth.mesh import Counts, Focus, PadMesh, domed, graded_box
 from synth.mesh.element import Element, p1p1, p2p1
 from synth.mesh.face import face_height
@@ -31,7 +29,7 @@ from synth.press.error_model import error_percent, face_error
 from synth.press.footprint import footprint
 from synth.press.posed_path import PosedPath
 from synth.press.scene_path import path_of
-from synth.scene import Gel, MeshIndenter, Scene
+from synth.scene import Gel, MeshIndenter, Numerics, Scene
 
 ELEMENTS_ACROSS = (4, 6, 8, 10, 12, 14, 16)
 """Elements across the contact to choose from."""
@@ -39,11 +37,6 @@ FINER = (20, 24, 28, 32, 40)
 """More of them, for a stated `fillet_mm` or a target in percent alone: they take minutes."""
 CONTACT_ACROSS = 12
 """Fewest elements across the contact where outputs.contact or slip asks for its edge."""
-Cells: TypeAlias = tuple[int, int, int]
-CELLS: tuple[Cells, ...] = ((16, 12, 2), (20, 16, 2), (20, 16, 3), (24, 20, 3))
-"""Shared meshes to choose from, by cost: elements along x and y and through the thickness."""
-MOST = 0.9
-"""Share of the draws that are to keep the target on a shared mesh; a finer one costs all of them."""
 ELEMENTS: dict[str, Callable[[], Element]] = {"auto": p2p1, "p1p1": p1p1, "p2p1": p2p1}
 TALLEST = 1.8
 """Largest height over width of the elements under the contact."""
@@ -245,25 +238,9 @@ def resolve(
     return Resolution(fineness.across, error, percent, mesh, fineness.through, fine)
 
 
-def shared_cells(scenes: Iterable[Scene], target_error_px: float, folder: Path | None = None) -> Cells:
-    """The fewest of CELLS with which MOST draws of a scene are predicted to keep a target, else the last.
-
-    Draws whose indenter cannot be built do not count.
-    """
-    zones: list[tuple[tuple[Focus, Scene], Gel]] = []
-    for scene in scenes:
-        with suppress(InputError):
-            zones.append((_focus(scene, folder), scene.sensor.gel))
-    for cells in CELLS if zones else CELLS[:1]:
-        errors = [predicted_error_px(whole, zone, shared_spacing_mm(gel, cells)) for (zone, whole), gel in zones]
-        if np.mean(np.array(errors) <= target_error_px) >= MOST:
-            break
-    return cells
-
-
-def shared_mesh(gel: Gel, cells: Cells) -> PadMesh:
+def shared_mesh(gel: Gel, numerics: Numerics) -> PadMesh:
     """The mesh of all trajectories of a pad; its Young's modulus does not enter."""
-    return _even_mesh(gel.size_mm, gel.dome_radius_mm, gel.layers_mm, cells)
+    return _even_mesh(gel.size_mm, gel.dome_radius_mm, gel.layers_mm, numerics.cells)
 
 
 @lru_cache(maxsize=4)
@@ -271,7 +248,7 @@ def _even_mesh(
     size_mm: tuple[float, float, float],
     dome_radius_mm: float | None,
     layers_mm: tuple[float, ...],
-    cells: Cells,
+    cells: tuple[int, int, int],
 ) -> PadMesh:
     """The structured mesh; kept, since a job asks for the same one again and again."""
     whole = Focus((0.0, 0.0), (size_mm[0] / 2, size_mm[1] / 2))
@@ -280,24 +257,24 @@ def _even_mesh(
     return domed(graded_box(size_mm, whole, counts, layers_mm), dome_radius_mm)
 
 
-def _width(size_mm: tuple[float, float, float], cells: Cells) -> float:
+def _width(size_mm: tuple[float, float, float], cells: tuple[int, int, int]) -> float:
     """Width of the elements, mm: geometric mean of both directions."""
     return float(np.sqrt(size_mm[0] / cells[0] * size_mm[1] / cells[1]))
 
 
-def shared_spacing_mm(gel: Gel, cells: Cells) -> float:
+def shared_spacing_mm(gel: Gel, numerics: Numerics) -> float:
     """Size of the elements at the contact face as the error model takes it: see `element_size`."""
-    size = gel.size_mm
+    size, cells = gel.size_mm, numerics.cells
     wide = _width(size, cells)
     growth = depth_growth(cells[2], size[2] / wide)
     return element_size(wide, size[2] / sum(growth**k for k in range(cells[2])))
 
 
-def accuracy(scene: Scene, cells: Cells, folder: Path | None = None) -> Accuracy:
+def accuracy(scene: Scene, folder: Path | None = None) -> Accuracy:
     """What the shared mesh gives for one instance; InputError where the indenter cannot be built."""
-    gel = scene.sensor.gel
+    gel, numerics = scene.sensor.gel, scene.numerics
     focus, scene = _focus(scene, folder)
-    spacing_mm = shared_spacing_mm(gel, cells)
-    across = int(2 * min(focus.half_mm) / _width(gel.size_mm, cells))
+    spacing_mm = shared_spacing_mm(gel, numerics)
+    across = int(2 * min(focus.half_mm) / _width(gel.size_mm, numerics.cells))
     errors = predicted_error_px(scene, focus, spacing_mm), error_percent(scene, focus, spacing_mm)
     return Accuracy(across, *errors)

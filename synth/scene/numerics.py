@@ -41,12 +41,11 @@ class Numerics(Part):
     edge_length_mm: Positive | None = None
     """Instead of a target: one fTetWild mesh for all trajectories with tetrahedra of this edge at the contact face."""
     solver: Literal["auto", "single", "batched"] = "auto"
-    """batched: many trajectories at once on one mesh of the pad, for GPUs; `cells` or edge_length_mm say which, else
-    target_error_px. The same laws and tolerances, other meshes: other samples. auto: batched where a GPU renders and
-    all sensors' pads can share a mesh."""
-    cells: tuple[Cells, Cells, Annotated[int, Field(ge=1, le=20)]] | None = None
-    """Elements of the batched solver's mesh along x and y, where they are even in size, and through the thickness;
-    default: as many as keep the target on most trajectories, within limits."""
+    """batched: many trajectories at once on one mesh of the pad, for GPUs; `cells` or edge_length_mm say which, and a
+    target is only what `plan` compares with. The same laws and tolerances, other meshes: other samples. auto: batched
+    where a GPU renders and all sensors' pads can share a mesh."""
+    cells: tuple[Cells, Cells, Annotated[int, Field(ge=1, le=20)]] = (16, 12, 2)
+    """Elements of the batched solver's mesh along x and y, where they are even in size, and through the thickness."""
     max_step_mm: Positive = 0.25
     """Longest motion of the indenter in one load step; steps are halved when Newton fails."""
     tolerance: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-6

@@ -32,10 +32,10 @@ from synth.pipeline.producer import Producer
 from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory, Task
 from synth.planning import plan, predict
 from synth.press.press import MeshRule, edge_radius_mm
-from synth.press.resolution import CELLS, MOST, Cells, accuracy, shared_mesh, shared_spacing_mm
+from synth.press.resolution import accuracy, shared_mesh, shared_spacing_mm
 from synth.render.variant import Variant
 from synth.sampling import MAX_DRAWS, draw, draw_sensor, sensor_of
-from synth.scene import BoxGel, Scene
+from synth.scene import BoxGel, Numerics, Scene
 from synth.scene.template import Template, load_scene
 from synth.simulate.solve import simulate_press
 
@@ -123,10 +123,8 @@ def test_one_trajectory_alone_is_the_same_failed_draws_are_replaced_and_the_mesh
     told = [dataset.entry(index).diagnostics for index in range(SAMPLES)]
     assert len({each["mesh"] for each in told}) == 2  # of two pads
     first, scene = told[0], dataset.scene_of(0)
-    cells = scene.numerics.cells
-    assert cells is not None
-    assert first["mesh"] == shared_mesh(scene.sensor.gel, cells).hash
-    assert first["predicted_error_px"] == round(accuracy(scene, cells).error_px, 4)
+    assert first["mesh"] == shared_mesh(scene.sensor.gel, scene.numerics).hash
+    assert first["predicted_error_px"] == round(accuracy(scene).error_px, 4)
     assert first["predicted_error_percent"] is None, "nothing is known of P1/P1 elements"
 
 
@@ -205,19 +203,20 @@ def test_items_made_ahead_come_in_order_with_errors_and_no_more_than_there_is_ro
 
 def test_the_shared_mesh_is_even_and_the_predicted_error_falls_with_its_spacing(template: Template) -> None:
     """Planes through the thickness: the first element is as high as the others are wide, as far as growth allows."""
-    mesh = shared_mesh(GEL, (16, 12, 2))
-    assert mesh is shared_mesh(GEL.model_copy(update={"youngs_modulus_kpa": 100.0}), (16, 12, 2))
+    numerics = Numerics(solver="batched", cells=(16, 12, 2))
+    mesh = shared_mesh(GEL, numerics)
+    assert mesh is shared_mesh(GEL.model_copy(update={"youngs_modulus_kpa": 100.0}), numerics)
     assert len(mesh.tets) == 6 * 16 * 12 * 2
     x, y, z = (np.unique(mesh.points[:, axis]) for axis in range(3))
     np.testing.assert_allclose(np.diff(x), 1.25, atol=1e-9)  # coordinates are multiples of 2e-10 mm
     np.testing.assert_allclose(np.diff(y), 1.25, atol=1e-9)
     assert z[1] == pytest.approx(max(1.25, 4.0 / 3.2), abs=1e-6)  # 1 + growth of at most 2.2
-    assert shared_spacing_mm(GEL, (16, 12, 2)) == pytest.approx(1.25, abs=1e-6)
+    assert shared_spacing_mm(GEL, numerics) == pytest.approx(1.25, abs=1e-6)
     # By the model's exponent of 1.6, at equal proportions of the elements; and the rule says the same.
     drawn = draw(template, SEED, 1)
     fine = drawn.model_copy(update={"numerics": drawn.numerics.model_copy(update={"cells": (16, 12, 2)})})
-    coarse, better = accuracy(drawn, (6, 4, 2)), accuracy(drawn, (16, 12, 2))
-    ratio = _spacing_of(drawn, (6, 4, 2)) / _spacing_of(drawn, (16, 12, 2))
+    coarse, better = accuracy(drawn), accuracy(fine)
+    ratio = _spacing_of(drawn) / _spacing_of(fine)
     assert ratio > 1.5
     # Coordinates are multiples of 2e-10 mm.
     assert coarse.error_px / better.error_px == pytest.approx(ratio**1.6, rel=1e-8)
@@ -227,23 +226,9 @@ def test_the_shared_mesh_is_even_and_the_predicted_error_falls_with_its_spacing(
     assert len(found.mesh.tets) == 6 * 16 * 12 * 2
 
 
-def test_the_shared_mesh_is_the_coarsest_that_keeps_the_target_on_most_draws() -> None:
-    template, rules = load_scene("gelsight_mini"), {}
-    for target in (0.7, 2.0, 0.01):
-        aimed = load_scene("gelsight_mini", [f"numerics.target_error_px={target}", "sampling.common_draws=true"])
-        rules[target] = plan(aimed, Variant("cuda_ad_rgb", "")).mesh
-    assert (rules[2.0].cells, rules[0.01].cells) == (CELLS[0], CELLS[-1])
-    cells, draws = rules[0.7].cells, [draw(template, 1, number) for number in range(40)]
-    coarser = CELLS[CELLS.index(cells) - 1]
-    within = [np.mean([accuracy(each, which).error_px <= 0.7 for each in draws]) for which in (coarser, cells)]
-    assert within[0] < MOST < within[1] + 0.1
-    own = plan(load_scene("gelsight_mini", ["numerics.cells=[8, 6, 2]"]), Variant("cuda_ad_rgb", ""))
-    assert own.mesh.cells == (8, 6, 2)
-
-
-def _spacing_of(drawn: Scene, cells: Cells) -> float:
+def _spacing_of(drawn: Scene) -> float:
     """Of the mesh itself: width, or where the elements are higher than wide the geometric mean of both."""
-    x, y, z = (np.unique(shared_mesh(drawn.sensor.gel, cells).points[:, axis]) for axis in range(3))
+    x, y, z = (np.unique(shared_mesh(drawn.sensor.gel, drawn.numerics).points[:, axis]) for axis in range(3))
     wide = float(np.sqrt((x[1] - x[0]) * (y[1] - y[0])))
     return float(np.sqrt(wide * max(wide, z[1] - z[0])))
 

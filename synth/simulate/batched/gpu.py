@@ -163,7 +163,7 @@ def inverse(matrix: scipy.sparse.csr_array, device: str) -> wp.array:
     except (MemoryError, RuntimeError) as error:
         raise InputError(
             f"the batched solver inverts a matrix of {k:,} unknowns, which takes {12e-9 * k * k:.1f} GB: {error}; "
-            'state fewer numerics.cells, or numerics.solver = "single"'
+            'simulate with numerics.solver = "single"'
         ) from error
     return found
 
