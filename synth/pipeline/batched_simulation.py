@@ -34,7 +34,7 @@ MOST_DRAWN = 4
 MIN_PER_SENSOR = 16
 """Waiting trajectories of a sensor that are worth building its renderer for; a clip alone is."""
 
-CORES_A_DRAWER = 4
+CORES_A_DRAWER = 2
 """Cores for each process that makes bodies."""
 
 Result = SimulatedTrajectory | Outcome

@@ -56,6 +56,10 @@ class Template:
     source: Path
     changed: tuple[str, ...] = ()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the corners: a process that is started with more than a pipe holds keeps its parent waiting."""
+        return {name: value for name, value in self.__dict__.items() if name != "corners"}
+
     @property
     def name(self) -> str:
         return str(self.content["name"])

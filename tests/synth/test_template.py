@@ -24,6 +24,16 @@ def test_shipped_scenes_are_known_by_name_and_a_template_needs_no_file(tmp_path,
     assert checked_template(content, tmp_path / "none.toml").hash == load_scene("deltact").hash
 
 
+@pytest.mark.parametrize("name", ["gelsight_mini", "objects"])
+def test_workers_are_handed_less_than_a_pipe_holds(name: str) -> None:
+    template = load_scene(name)
+    known, corners = template.hash, template.corners
+    handed = pickle.dumps(template)
+    assert len(handed) < 32 * 1024
+    assert pickle.loads(handed).corners == corners
+    assert vars(pickle.loads(handed))["hash"] == known, "files may change while a job runs"
+
+
 def test_overrides_set_tables_lists_and_words_and_the_last_wins(tiny: Path) -> None:
     torus = 'contact.indenter={ shape = "torus", radius_mm = 1.0, tube_mm = 0.3 }'
     words = ["motion.depth_mm=0.25", "sensor.lights.1.power=7", "name=another", "outputs.depth=true", torus]

@@ -26,6 +26,9 @@ Asked = tuple[Press, frozenset[int] | None]
 Numbered = tuple[int, Asked]
 RUNS = 2
 """Runs that take turns: a GPU is at work on one's lanes while the host leads the other's."""
+LARGE = 30_000
+"""Unknowns from which on one run has all lanes: to read the inverse takes longer than the host does, for half of them
+as long as for all."""
 MAX_BATCH = 512
 AHEAD = 8
 """Presses that wait for a lane, at most: more than end in a cycle, and few enough to be made beside its work."""
@@ -45,7 +48,7 @@ def simulate_presses(
     more whenever some have ended, even if it had none the last time. `options` hold along the load paths.
     """
     more, waiting = map(partial(_checked, pad), enumerate(asked)), deque[Numbered]()
-    runs: list[Run | None] = [None] * min(RUNS, batch)
+    runs: list[Run | None] = [None] * min(RUNS if len(pad.free) < LARGE else 1, batch)
     lanes = batch // len(runs)
     while True:
         for k, run in enumerate(runs):
