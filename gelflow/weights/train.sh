@@ -3,7 +3,8 @@
 #
 # CLIPS is a folder of videos of a real gel. DEVICES is the number of GPUs of the fifth and sixth stage, PAIRS that of
 # pairs of a scene in the first. The first four stages of the shipped weights used the scenes of version 0.1.0. They
-# are those of the ninth stage: the tenth and the eleventh, with specks and on finer truth, are for the next ones.
+# are those of the ninth stage: the tenth and the eleventh, with specks and on finer truth, are for the next ones. Tried
+# without the real pairs, they made those worse.
 set -euo pipefail
 clips=$1 out=$2 devices=${DEVICES:-1} n=${PAIRS:-900} here=$(cd "$(dirname "$0")" && pwd)
 others="densetact fingervision gelsight gelsight_fingertip gelslim gelstereo omnitact tac3d"
@@ -81,5 +82,5 @@ finetune 6 5 8500 3e-4 300 3 "$out/real" "$out"/again/* --devices "$devices"
 denoise 7 6 4300 0 0 "$out"/fresh/*
 denoise 8 7 5800 5 0 "$out"/more/*
 denoise 9 8 5000 5 0.0625 "$out"/most/*
-finetune 10 9 2500 2e-4 100 4 "$out"/fine/* --set specks=0.5 --set compression=0.03125
+finetune 10 9 2500 2e-4 100 4 "$out/real" "$out"/fine/* --set specks=0.5 --set compression=0.03125
 denoise 11 10 2500 6 0.0625 "$out"/fine/* --set specks=0.5
