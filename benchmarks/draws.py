@@ -14,13 +14,16 @@ from contextlib import suppress
 from functools import partial
 from itertools import groupby
 from multiprocessing import get_context
+from pathlib import Path
 
 from benchmarks.rows import Row, arguments, machine, measure, show
 from synth.errors import InputError
+from synth.mesh.cache import user_cache
 from synth.pipeline.batched_simulation import BATCH
 from synth.pipeline.pads import pad_key
 from synth.press.press import BLUNTER, MeshRule, Press, blunter
 from synth.sampling import draw, samples_of
+from synth.scene import Scene
 from synth.scene.template import SCENES, load_scene
 from synth.simulate import Trajectory
 from synth.simulate.batched import simulate_presses
@@ -35,7 +38,7 @@ def drawn(case: Row, settings: Sequence[str] = ()) -> tuple[Press, frozenset[int
     seed, number = case["seed"], case["trajectory"]
     try:
         scene = draw(template, seed, number)
-        press = MeshRule.of(scene, case["device"] == "cuda").press(scene, template.source.parent)
+        press = _pressed(case, scene, template.folder)
     except InputError as error:
         return str(error)
     pairs = samples_of(template, seed, number, scene.motion.steps)
@@ -47,7 +50,12 @@ def tries(case: Row, press: Press) -> Iterator[Press]:
     yield press
     for scene in blunter(press):
         with suppress(InputError):
-            yield MeshRule.of(scene, case["device"] == "cuda").press(scene, load_scene(case["scene"]).folder)
+            yield _pressed(case, scene, load_scene(case["scene"]).folder)
+
+
+def _pressed(case: Row, scene: Scene, folder: Path) -> Press:
+    """A scene's press; the meshes of fTetWild, which is random, are those of the user's cache."""
+    return MeshRule.of(scene, case["device"] == "cuda").press(scene, folder, (user_cache(),))
 
 
 def found(result: Trajectory, shown: frozenset[int], rounder: int) -> Row:
@@ -79,6 +87,7 @@ def one(case: Row) -> Row:
 def together(case: Row, workers: int) -> list[Row]:
     """All draws of a scene by the batched solver; their bodies are made by processes."""
     cases = [{**case, "trajectory": number} for number in range(case["draws"])]
+    drawn(cases[0], ['numerics.solver="batched"'])  # so that processes find a round gel's mesh
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
         made = list(pool.map(partial(drawn, settings=['numerics.solver="batched"']), cases, chunksize=4))
     rows = {number: {"status": "unbuilt", "reason": each} for number, each in enumerate(made) if isinstance(each, str)}
