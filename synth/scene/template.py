@@ -198,9 +198,7 @@ def replaced(value: Any, choose: Chooser) -> Any:
 def with_files(value: Any, change: Callable[[str], Any], key: str = "") -> Any:
     """A part of a template, the one under `key`, with every name of a file in it replaced by what `change` returns."""
     if isinstance(value, dict):
-        return {
-            name: with_files(inner, change, key if name in DISTRIBUTIONS else name) for name, inner in value.items()
-        }
+        return {name: with_files(part, change, key if name in DISTRIBUTIONS else name) for name, part in value.items()}
     if isinstance(value, list):
         return [with_files(inner, change, key) for inner in value]
     return change(value) if key in FILES and isinstance(value, str) else value
@@ -260,24 +258,20 @@ def _find(name_or_path: str | Path) -> Path:
 
 def _apply(content: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
-    steps = key.strip().split(".")
+    steps, told = key.strip().split("."), f"--set {override!r}: "
     if not equals or not all(steps) or len(steps) > DEEPEST or len(override.splitlines()) > 1:
-        raise InputError(f"--set {override!r}: give key=value, for instance --set motion.depth_mm=1.2, in one line")
+        raise InputError(f"{told}give key=value, for instance --set motion.depth_mm=1.2, in one line")
     value = assigned_value(text, f"--set {key}")
     target: Any = content
     for depth, step in enumerate(steps):
         place: Any = int(step) if isinstance(target, list) and step.isdigit() else step
         if isinstance(target, list) and not (isinstance(place, int) and place < len(target)):
-            raise InputError(
-                f"--set {override!r}: {step!r} is not an entry of a list of {len(target)} (0 is the first)"
-            )
+            raise InputError(f"{told}{step!r} is not an entry of a list of {len(target)} (0 is the first)")
         if _is_distribution(target):
             above = ".".join(steps[:depth])
-            raise InputError(
-                f"--set {override!r}: {above} is a distribution; give all of it, as in --set '{above}=...'"
-            )
+            raise InputError(f"{told}{above} is a distribution; give all of it, as in --set '{above}=...'")
         if not isinstance(target, list | dict):
-            raise InputError(f"--set {override!r}: {step!r} lies inside a value that is not a table")
+            raise InputError(f"{told}{step!r} lies inside a value that is not a table")
         if depth == len(steps) - 1:
             target[place] = with_files(value, os.path.abspath, step)
         elif isinstance(target, dict):
