@@ -13,7 +13,8 @@ A Lambertian surface's radiance is its albedo ρ times its irradiance E over π,
   to a light that gives next to nothing there count as having reached it.
 - E_bounced, light that the gel reflects onto itself, does not depend on the view. It is sampled at points of the gel's
   faces and projected (L²) onto functions that are linear on each face, or constant where few of the face's pilots saw
-  gel: such faces get little, and its mean is less noisy than its slope. A plane has none.
+  gel: such faces get little, and its mean is less noisy than its slope. A plane has none. It begins as the mean light
+  of a face's pilots.
   In a round gel, all of which sees itself, it is smooth and is fitted (`synth.render.smooth_light`).
 - The lights l include their mirror images behind the window (`synth.render.lights`).
 - E_returned, light that the gel sends to the window and gets back, is smooth and fitted as well.
@@ -51,8 +52,8 @@ _RETURNING_PATHS = 144
 """Paths from each point at which light that comes back from the window is sampled."""
 _NEGLIGIBLE = 3e-3
 """Share of all light on a point up to which a light's shadows are not sampled."""
-_NODES, _BOUNCED_NODES = 14, 6
-"""Points of a light without closed form for a pixel, and for a point on which bounced light begins."""
+_NODES, _PILOT_NODES = 14, 6
+"""Points of a light without closed form for a pixel, and for a point of a face."""
 _BITS = 32
 """Lights in a word of a face's mask."""
 _SHIFT = (0.7548776662466927, 0.5698402909980532)
@@ -133,21 +134,22 @@ class SeparatedLight:
             faces' corners (channels of 3 of mi.Float), without channels where there is none.
         """
         mi, dr, gel, faces = self._mi, self._dr, self._gel, sizes[1]
-        masks, seen = self._pilots(frame["seeds"][0], faces)
+        masks, direct, seen = self._pilots(frame["seeds"][0], faces)
         shaded = [self._with_neighbours(mask, sizes[0]) for mask in masks]
         indirect: list[list[Any]] = []
         if bounces:
             count = count_per_face(primary, faces)
-            points = FacePoints.on(gel, count, 2 * (self.max_depth - 2), frame["seeds"][1], mi)
-            values = self._bounces(points, shaded, frame["top"])
+            points = FacePoints.on(gel, count, self.max_depth - 2, frame["seeds"][1], mi)
+            values = self._bounces(points, direct, frame["top"])
             if frame["cavity"] is None:
                 indirect = projected(values, points.weights, count, seen)
             else:
                 indirect = self._smooth(frame["cavity"], values, count)
         if frame["returning"] is not None:
-            draws = 2 * (self.max_depth - 2)
-            points = FacePoints.on(gel, _RETURNING_PATHS, draws, frame["seeds"][2], mi, frame["returning"])
-            returned = self._smooth(frame["window"], self._bounces(points, shaded), _RETURNING_PATHS)
+            draws, seed = self.max_depth - 2, frame["seeds"][2]
+            points = FacePoints.on(gel, _RETURNING_PATHS, draws, seed, mi, frame["returning"])
+            values = self._bounces(points, direct)
+            returned = self._smooth(frame["window"], values, _RETURNING_PATHS)
             both = zip(indirect or returned, returned, strict=True)
             indirect = [[a + b for a, b in zip(*pair, strict=True)] for pair in both] if indirect else returned
         dr.eval(shaded, indirect)
@@ -166,7 +168,6 @@ class SeparatedLight:
         seen, _ = self._gel.kinds(hit, active)
         at = self._gel.point(ray, hit, False, seen)
         normal = dr.mulsign(mi.Vector3f(at.sh_frame.n), at.wi.z)  # the coating reflects on either side
-        light = [mi.Float(0) for _ in range(self._channels)]
         if self._measured is None:
             dr.eval(at.p, at.n, at.uv, normal, seen, hit.prim_index, hit.prim_uv)
             count = dr.maximum(dr.block_sum(dr.select(seen, mi.Float(1), 0), samples), 1)
@@ -176,6 +177,14 @@ class SeparatedLight:
             vectors = self._whole(place / count, dr.normalize(facing), _NODES)
             dr.eval(vectors)
             light = [dr.dot(normal, dr.repeat(vector, samples)) for vector in vectors]
+        else:
+            measured = self._measured
+
+            def give(_: PolygonLight, number: Any, *total: Any) -> list[Any]:
+                given = measured.irradiance(number, at, normal, seen)
+                return [a + b for a, b in zip(given, total, strict=True)]
+
+            light = self._over_lights(give, [mi.Float(0) for _ in range(self._channels)])
         light = self._less_blocked(light, at, normal, hit.prim_index, sampler.next_2d(), shaded, seen)
         weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
         for channel, values in enumerate(indirect):
@@ -194,12 +203,6 @@ class SeparatedLight:
         dr.eval(smooth)
         return [[dr.gather(mi.Float, channel, corner) for corner in gel.corners] for channel in smooth]
 
-    def _direct(self, at: Any, normal: Any, face: Any, offset: Any, shaded: list[Any]) -> list[Any]:
-        """Irradiance (channels) of points on faces, by all lights, less what is blocked."""
-        mi, dr = self._mi, self._dr
-        light = [dr.dot(vector, normal) for vector in self._whole(at.p, normal, _BOUNCED_NODES)]
-        return self._less_blocked(light, at, normal, face, offset, shaded, mi.Bool(True))
-
     def _whole(self, point: Any, normal: Any, nodes: int) -> list[Any]:
         """Vector irradiance (channels of mi.Vector3f) of points by all lights, nothing standing between."""
 
@@ -212,23 +215,20 @@ class SeparatedLight:
     def _less_blocked(
         self, light: list[Any], at: Any, normal: Any, face: Any, offset: Any, shaded: list[Any], active: Any
     ) -> list[Any]:
-        """Irradiance (channels) of points on faces less what is blocked of it; measured light where nothing is."""
+        """Irradiance (channels) of points on faces less what is blocked of it."""
         mi, dr = self._mi, self._dr
         masks = [dr.gather(mi.UInt32, mask, face, active) for mask in shaded]
 
-        def add(light: PolygonLight, number: Any, *total: Any) -> list[Any]:
-            mask = mi.UInt32(0)
-            for word, own in enumerate(masks):
-                mask = dr.select(number // _BITS == word, own, mask)
-            asked = active & (((mask >> (number % _BITS)) & 1) != 0)
-            blocked = self._blocked(light, number, at, normal, offset, asked)
+        def subtract(light: PolygonLight, number: Any, *total: Any) -> list[Any]:
+            value, blocked = self._sampled(light, number, at, normal, offset)
             if self._measured is None:
-                value, given = -blocked, light.radiance
+                lost, given = dr.select(blocked, -value, 0), light.radiance
             else:
-                value, given = dr.select(blocked > 0, 0, 1), self._measured.irradiance(number, at, normal, active)
-            return [dr.fma(value, color, sum_) for color, sum_ in zip(given, total, strict=True)]
+                lost = dr.select(blocked & (value > 0), mi.Float(-1), 0)
+                given = self._measured.irradiance(number, at, normal, active)
+            return [dr.fma(lost, color, sum_) for color, sum_ in zip(given, total, strict=True)]
 
-        return self._over_lights(add, light)
+        return self._over_marked(subtract, light, masks)
 
     def _over_lights(self, add: Callable[..., list[Any]], sums: list[Any]) -> list[Any]:
         """Sums after `add`, called with each light, its number (mi.UInt32) and the sums so far."""
@@ -246,15 +246,31 @@ class SeparatedLight:
             before = before + table.count
         return sums
 
-    def _blocked(self, light: PolygonLight, number: Any, at: Any, normal: Any, offset: Any, asked: Any) -> Any:
-        """What of `_sampled` is blocked (mi.Float): computed only where it is `asked`, 0 elsewhere."""
-        dr = self._dr
+    def _over_marked(self, add: Callable[..., list[Any]], sums: list[Any], masks: list[Any]) -> list[Any]:
+        """As `_over_lights`, with those alone whose bits are set: few, so that a loop goes from one to the next."""
+        mi, dr = self._mi, self._dr
+        before = mi.Int32(0)
+        for table in self._lights:
+            after = before + mi.Int32(table.count)
+            for word, mask in enumerate(masks):
+                first = _BITS * word
 
-        def sample(at: Any, normal: Any, offset: Any) -> Any:
-            value, blocked = self._sampled(light, number, at, normal, offset)
-            return dr.select(blocked, value, 0)
+                def step(
+                    left: Any, *sums: Any, table: LightTable = table, before: Any = before, first: int = first
+                ) -> tuple[Any, ...]:
+                    number = mi.Int32(dr.tzcnt(left)) + first
+                    light = table.light(mi.UInt32(number - before))
+                    return left & (left - 1), *add(light, mi.UInt32(number), *sums)
 
-        return dr.if_stmt((at, normal, offset), asked, sample, lambda *_: self._mi.Float(0))
+                own = mask & self._below(after - first) & ~self._below(before - first)
+                _, *sums = dr.while_loop((own, *sums), lambda left, *_: left != 0, step)
+            before = after
+        return sums
+
+    def _below(self, count: Any) -> Any:
+        """A word of which the lowest bits (mi.Int32) are set, all or none where there are not as many."""
+        mi, dr = self._mi, self._dr
+        return dr.select(count >= _BITS, mi.UInt32(2**_BITS - 1), (mi.UInt32(1) << dr.clip(count, 0, _BITS - 1)) - 1)
 
     def _sampled(self, light: PolygonLight, number: Any, at: Any, normal: Any, offset: Any) -> Any:
         """Irradiance per radiance that a point of the light gives unless its ray is blocked, and whether it is."""
@@ -267,32 +283,35 @@ class SeparatedLight:
         place, value = light.sample(at.p, moved - dr.floor(moved))
         return place, dr.maximum(dr.dot(value, normal), 0)
 
-    def _pilots(self, seed: Any, faces: int) -> tuple[list[Any], Any]:
-        """Masks of the lights before which a pilot of a face was blocked; whether many pilots met the gel (mi.Bool)."""
+    def _pilots(self, seed: Any, faces: int) -> tuple[list[Any], list[Any], Any]:
+        """What rays from all faces find out.
+
+        Returns:
+            Of each face, masks of the lights before which one was blocked, irradiance by all lights (channels of
+            mi.Float), and whether many met the gel (mi.Bool).
+        """
         mi, dr = self._mi, self._dr
         count = count_per_face(_PILOTS, faces)
         points = FacePoints.on(self._gel, count, 2, seed, mi)
-        shared = points.at, points.normal, next(points.numbers)
+        at, normal, offset = points.at, points.normal, next(points.numbers)
+        whole = [dr.dot(vector, normal) for vector in self._whole(at.p, normal, _PILOT_NODES)]
 
-        def add(light: PolygonLight, number: Any, *total: Any) -> list[Any]:
-            _, value = self._point(light, number, *shared)
-            return [dr.fma(value, color, sum_) for color, sum_ in zip(light.radiance, total, strict=True)]
+        def mark(light: PolygonLight, number: Any, *sums: Any) -> list[Any]:
+            value, blocked = self._sampled(light, number, at, normal, offset)
+            lost = [dr.select(blocked, value * color, 0) for color in light.radiance]
+            counts = reduce(or_, (less > _NEGLIGIBLE * total for less, total in zip(lost, whole, strict=True)))
+            bit = dr.select(counts, mi.UInt32(1) << (number % _BITS), 0)
+            left = [sum_ - less for sum_, less in zip(sums[self._words :], lost, strict=True)]
+            masks = [m | dr.select(number // _BITS == word, bit, 0) for word, m in enumerate(sums[: self._words])]
+            return [*masks, *left]
 
-        whole = self._over_lights(add, [mi.Float(0) for _ in range(self._channels)])
-
-        def mark(light: PolygonLight, number: Any, *masks: Any) -> list[Any]:
-            value, blocked = self._sampled(light, number, *shared)
-            given = zip(light.radiance, whole, strict=True)
-            counts = reduce(or_, (value * color > _NEGLIGIBLE * total for color, total in given))
-            bit = dr.select(blocked & counts, mi.UInt32(1) << (number % _BITS), 0)
-            return [mask | dr.select(number // _BITS == word, bit, 0) for word, mask in enumerate(masks)]
-
-        masks = self._over_lights(mark, [mi.UInt32(0) for _ in range(self._words)])
-        _, _, straight, _ = self._onward(points.at, points.normal, next(points.numbers))  # the image is no bounce
+        found = self._over_lights(mark, [mi.UInt32(0) for _ in range(self._words)] + whole)
+        _, _, straight, _ = self._onward(at, normal, next(points.numbers))  # the image is no bounce
         met = dr.select(straight, mi.UInt32(1), 0)
-        dr.eval(masks, met)
-        masks = [dr.block_reduce(dr.ReduceOp.Or, mask, count) for mask in masks]
-        return masks, dr.block_sum(met, count) >= _MANY * count
+        dr.eval(found, met)
+        masks = [dr.block_reduce(dr.ReduceOp.Or, mask, count) for mask in found[: self._words]]
+        light = [dr.maximum(dr.block_sum(each, count) / count, 0) for each in found[self._words :]]
+        return masks, light, dr.block_sum(met, count) >= _MANY * count
 
     def _with_neighbours(self, mask: Any, vertices: int) -> Any:
         """Masks of faces (mi.UInt32), each with those of all faces that share a vertex with it."""
@@ -302,21 +321,15 @@ class SeparatedLight:
             dr.scatter_reduce(dr.ReduceOp.Or, touched, mask, corner)
         return reduce(or_, (dr.gather(mi.UInt32, touched, corner) for corner in self._gel.corners))
 
-    def _bounces(self, points: FacePoints, shaded: list[Any], top: Any | None = None) -> list[Any]:
+    def _bounces(self, points: FacePoints, direct: list[Any], top: Any | None = None) -> list[Any]:
         """Irradiance (channels) from the gel itself, one path from each point.
 
-        Its first step goes by the window, or straight: then `top` is a height that the gel does not reach.
+        Its first step goes by the window, or straight: then `top` is a height that the gel does not reach. `direct` is
+        the light of faces, from `_pilots`.
         """
         mi, dr = self._mi, self._dr
         at, normal, active = points.at, points.normal, mi.Bool(True)
         total, share = ([mi.Float(value) for _ in range(self._channels)] for value in (0, 1))
-
-        def dark(*_: Any) -> tuple[Any, ...]:
-            return tuple(mi.Float(0) for _ in range(self._channels))
-
-        def direct(at: Any, normal: Any, face: Any, offset: Any) -> tuple[Any, ...]:
-            return tuple(self._direct(at, normal, face, offset, shaded))
-
         for step in range(self.max_depth - 2):
             ray, hit, straight, mirrored = self._onward(at, normal, next(points.numbers), None if step else top)
             active &= straight | mirrored if step else mirrored if top is None else straight
@@ -324,8 +337,7 @@ class SeparatedLight:
             normal = -mi.Vector3f(at.sh_frame.n)
             kept = dr.select(mirrored, reflectance(dr.abs(ray.d.z), self._index, mi), 1)
             share = [s * a * kept for s, a in zip(share, self._albedo.at(at.uv, active), strict=True)]
-            # Few paths meet the gel: only their light is computed.
-            light = dr.if_stmt((at, normal, hit.prim_index, next(points.numbers)), active, direct, dark)
+            light = [dr.gather(mi.Float, each, hit.prim_index, active) for each in direct]
             total = [sum_ + dr.select(active, s * e, 0) for sum_, s, e in zip(total, share, light, strict=True)]
         return total
 
