@@ -1,7 +1,7 @@
 """What a GPU does differently: dense matrices, by cuBLAS and cuSOLVER on an NVIDIA GPU and by NumPy elsewhere.
 
 All else of a batch is Warp's kernels, the same on every device. Products and transposes take and give float32, and sums
-are float32. A GPU takes the factors of a product as TF32, so callers round them to that before
+are float32. A GPU takes the factors of a product as bfloat16, so callers round them to that before
 (`synth.simulate.batched.krylov`).
 
 NVIDIA's mathematical libraries, loaded through ctypes: nothing of torch is imported, which brings them along. They come
@@ -23,7 +23,7 @@ import scipy.sparse
 import warp as wp
 
 from synth.errors import InputError
-from synth.simulate.batched.krylov import padded, round_rows, scatter
+from synth.simulate.batched.krylov import padded, round_rows, scatter, shorten
 
 NEEDS = {"cublas": ("cublasLt",), "cusolver": ("nvJitLink", "cusparse", "cublas")}
 """Libraries that are loaded before, since a wheel's library does not always know where the others are."""
@@ -73,17 +73,19 @@ FLOAT64 = 1  # CUDA_R_64F
 COLUMNS = 1024  # of the inverse that are found at a time on a GPU, to save memory
 WORKSPACE = 32 << 20
 """Bytes given to cuBLAS, so that it allocates none of its own: NVIDIA's recommendation for Hopper."""
-_REAL, _TF32, _DEFAULT, _PLAIN, _TURNED = 0, 77, -1, 0, 1
-"""CUDA_R_32F, CUBLAS_COMPUTE_32F_FAST_TF32, CUBLAS_GEMM_DEFAULT, CUBLAS_OP_N, CUBLAS_OP_T."""
+_REAL, _SHORT, _SINGLE, _DEFAULT, _PLAIN, _TURNED = 0, 14, 68, -1, 0, 1
+"""CUDA_R_32F, CUDA_R_16BF, CUBLAS_COMPUTE_32F, CUBLAS_GEMM_DEFAULT, CUBLAS_OP_N, CUBLAS_OP_T."""
+_AMPERE = 80
+"""Architecture from which on GPUs multiply bfloat16."""
 
 
 class Dense(Protocol):
-    """What a device offers; all arrays float32, row by row."""
+    """What a device offers; arrays float32, row by row."""
 
     def product(self, a: wp.array, x: wp.array, c: wp.array, wanted: wp.array) -> None:
-        """Give c = x A for symmetric A (n, n) and x, c (b, n), at least in rows where wanted (b,) is 1.
+        """Give c = x A for symmetric A (n, n), of `inverse`, and x, c (b, n), at least in rows where wanted (b,) is 1.
 
-        Numbers of A and x that TF32 does not have are rounded on a GPU and not elsewhere.
+        Numbers of x that bfloat16 does not have are rounded on a GPU and not elsewhere.
         """
 
     def transpose(self, x: wp.array, c: wp.array) -> None:
@@ -118,18 +120,29 @@ class Cublas:
             call("cublas", "cublasCreate_v2", ctypes.byref(self._handle))
         weakref.finalize(self, call, "cublas", "cublasDestroy_v2", self._handle).atexit = False
         self._one, self._zero = ctypes.c_float(1.0), ctypes.c_float(0.0)
+        self._short: dict[tuple[int, ...], wp.array] = {}
 
     def product(self, a: wp.array, x: wp.array, c: wp.array, wanted: wp.array) -> None:
         """See Dense; all rows."""
         b, n = x.shape
+        if a.dtype == wp.bfloat16:
+            x = self._shortened(x)
         self._join()
+        kind = _SHORT if a.dtype == wp.bfloat16 else _REAL
         # cuBLAS counts by columns: what it sees is C^T = A^T X^T. Summation runs along memory in both factors, the
-        # only order that Hopper's TF32 instructions take.
+        # order that suits tensor cores.
         call(
             "cublas", "cublasGemmEx", self._handle, _TURNED, _PLAIN, n, b, n, ctypes.byref(self._one),
-            ctypes.c_void_p(a.ptr), _REAL, n, ctypes.c_void_p(x.ptr), _REAL, n, ctypes.byref(self._zero),
-            ctypes.c_void_p(c.ptr), _REAL, n, _TF32, _DEFAULT,
+            ctypes.c_void_p(a.ptr), kind, n, ctypes.c_void_p(x.ptr), kind, n, ctypes.byref(self._zero),
+            ctypes.c_void_p(c.ptr), _REAL, n, _SINGLE, _DEFAULT,
         )  # fmt: skip
+
+    def _shortened(self, x: wp.array) -> wp.array:
+        """In bfloat16, in memory of its own for each shape: a graph that is captured keeps its place."""
+        if x.shape not in self._short:
+            self._short[x.shape] = wp.empty(x.shape, dtype=wp.bfloat16, device=self._device)
+        wp.launch(shorten, x.shape, inputs=[x, self._short[x.shape]], device=self._device)
+        return self._short[x.shape]
 
     def transpose(self, x: wp.array, c: wp.array) -> None:
         m, n = x.shape
@@ -147,19 +160,22 @@ class Cublas:
 
 
 def inverse(matrix: scipy.sparse.csr_array, device: str) -> wp.array:
-    """(rows, rows) of a symmetric matrix (k, k): its inverse in TF32, then zeros to the length of Krylov vectors.
+    """(rows, rows) of a symmetric matrix (k, k): its inverse in bfloat16, then zeros to the length of Krylov vectors.
 
-    2 k³ flops in float64: on a CPU 15 s for 13,000 unknowns at 300 GFLOP/s. InputError where memory does not suffice,
-    or for CUDA without cuSOLVER; numpy.linalg.LinAlgError for a singular matrix.
+    It is stored as float32 where a device does not multiply bfloat16. 2 k³ flops in float64: on a CPU 15 s for 13,000
+    unknowns at 300 GFLOP/s. InputError where memory does not suffice, or for CUDA without cuSOLVER;
+    numpy.linalg.LinAlgError for a singular matrix.
     """
     k, where = matrix.shape[0], wp.get_device(device)
     try:
         full = filled(matrix, where)
-        found = wp.zeros((padded(k), padded(k)), dtype=wp.float32, device=where)
+        short = where.is_cuda and where.arch >= _AMPERE
+        found = wp.zeros((padded(k), padded(k)), dtype=wp.bfloat16 if short else wp.float32, device=where)
         if where.is_cuda:
             _invert_by_cusolver(full, found)
         else:
-            wp.launch(round_rows, (k, k), inputs=[np.linalg.inv(full.numpy()), 0, found], device=where)
+            rows = wp.array(np.linalg.inv(full.numpy()), device=where, copy=False)
+            wp.launch(round_rows, (k, k), inputs=[rows, 0, found], device=where)
     except (MemoryError, RuntimeError) as error:
         raise InputError(
             f"the batched solver inverts a matrix of {k:,} unknowns, which takes {12e-9 * k * k:.1f} GB: {error}; "

@@ -11,12 +11,13 @@ has. The tangent's product wants lanes next to each other, (rows, B); `synth.sim
 and its result. Sums are taken by a block in a fixed order, so that nothing here depends on other lanes (what
 goes in does on a GPU: see `synth.simulate.batched.solver`).
 
-What goes into the preconditioner is rounded before to TF32, 8 bits for the exponent and 10 after the point, by the same
-kernels on every device. An H200 then finds nothing to round in its factors, the products of two such numbers are exact
-in single precision, and only their sums are left between it and a CPU.
+What goes into the preconditioner is rounded before to bfloat16, 8 bits for the exponent and 7 after the point, by the
+same kernels on every device. Products of two such numbers are exact in single precision, so that only their sums are
+left between a GPU and a CPU.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -44,7 +45,7 @@ class Krylov:
         k: (B,) iterations done.
         size: (B,) norm of the right side; goal: of the residual, relative to it.
         basis: (B, LIMIT + 1, rows / 4); corrections: (B, LIMIT, rows / 4), the preconditioned basis.
-        current: (B, rows / 4) the last basis vector, in TF32; preconditioned: K_0^{-1} times it.
+        current: (B, rows / 4) the last basis vector, in bfloat16; preconditioned: K_0^{-1} times it.
         corrected: the same, (rows, B).
         image: (rows, B) the tangent times corrected; product: the same, (B, rows / 4).
         triangle: (B, LIMIT, LIMIT) rotated Hessenberg matrices by columns.
@@ -127,7 +128,7 @@ def begin_solves(
         if unknown >= 0 and size > wp.float64(0.0):
             found[k] = wp.float32(-residual[s, unknown] / size)
     krylov.basis[s, 0, i] = found
-    krylov.current[s, i] = rounded_four(found)
+    krylov.current[s, i] = four_in_bfloat16(found)
     if i == 0:
         krylov.goal[s] = wp.float32(numbers[s, Number.GOAL])
         krylov.size[s] = size
@@ -173,7 +174,7 @@ def arnoldi(rows: int) -> wp.Kernel:
         wp.tile_store(krylov.corrections[s, k], z, bounds_check=False)
         v = w * scale
         wp.tile_store(krylov.basis[s, k + 1], v, bounds_check=False)
-        wp.tile_store(krylov.current[s], wp.tile_map(rounded_four, v), bounds_check=False)
+        wp.tile_store(krylov.current[s], wp.tile_map(four_in_bfloat16, v), bounds_check=False)
         if thread == 0:
             length = wp.sqrt(above * above + below * below)
             cosine = wp.float32(1.0)
@@ -260,28 +261,29 @@ def release(
         share[s] = wp.float64(1.0)
 
 
-HALF, KEPT = wp.constant(wp.uint32(0x1000)), wp.constant(wp.uint32(0xFFFFE000))
-"""Half of the last bit that is kept, and all the bits that are."""
+@wp.func
+def in_bfloat16(x: wp.float32) -> wp.float32:
+    """To the nearest bfloat16; what is not finite stays."""
+    return wp.float32(wp.bfloat16(x))
 
 
 @wp.func
-def rounded(x: wp.float32) -> wp.float32:
-    """To the nearest TF32 number, away from zero between two; what is not finite stays."""
-    if not wp.isfinite(x):
-        return x
-    return wp.cast((wp.cast(x, wp.uint32) + HALF) & KEPT, wp.float32)
-
-
-@wp.func
-def rounded_four(x: wp.vec4f) -> wp.vec4f:
-    return wp.vec4f(rounded(x[0]), rounded(x[1]), rounded(x[2]), rounded(x[3]))
+def four_in_bfloat16(x: wp.vec4f) -> wp.vec4f:
+    return wp.vec4f(in_bfloat16(x[0]), in_bfloat16(x[1]), in_bfloat16(x[2]), in_bfloat16(x[3]))
 
 
 @wp.kernel
-def round_rows(rows: wp.array2d(dtype=wp.float64), first: int, matrix: wp.array2d(dtype=wp.float32)):
-    """Rows of a matrix, from a first one on; one thread per number."""
+def round_rows(rows: wp.array2d(dtype=wp.float64), first: int, matrix: wp.array2d(dtype=Any)):
+    """Rows of a matrix in bfloat16, from a first one on, as numbers of the matrix's type; one thread per number."""
     i, j = wp.tid()
-    matrix[first + i, j] = rounded(wp.float32(rows[i, j]))
+    matrix[first + i, j] = matrix.dtype(in_bfloat16(wp.float32(rows[i, j])))
+
+
+@wp.kernel
+def shorten(x: wp.array2d(dtype=wp.float32), found: wp.array2d(dtype=wp.bfloat16)):
+    """One thread per number, which is rounded already."""
+    i, j = wp.tid()
+    found[i, j] = wp.bfloat16(x[i, j])
 
 
 @wp.kernel

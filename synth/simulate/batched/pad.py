@@ -3,8 +3,8 @@
 The preconditioner is the inverse of the undeformed pad's stiffness, as one dense matrix.
 
 All lanes share a mesh, so that K_0^{-1} times all their vectors is one matrix product. The inverse is found in double
-precision, on CUDA by cuSOLVER, and applied in TF32 (`synth.simulate.batched.krylov`): a preconditioner that changes a
-little with its argument, which flexible GMRES allows for.
+precision, on CUDA by cuSOLVER, and applied in bfloat16 (`synth.simulate.batched.krylov`): a preconditioner that changes
+a little with its argument, which flexible GMRES allows for.
 """
 
 from dataclasses import dataclass
