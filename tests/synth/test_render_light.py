@@ -105,6 +105,19 @@ def test_a_small_shadow_falls_on_two_triangles_as_on_many() -> None:
 
 
 @needs_llvm
+def test_a_shadow_of_more_lights_than_a_word_has_bits() -> None:
+    """Two kinds of light, and each in forty parts at its place: what a panel hides of them is the same."""
+    wide = Light(position_mm=(8.0, 2.0, 2.0), size_mm=(0.05, 0.05), color=(1, 1, 1), power=100)
+    kinds = (wide, wide.model_copy(update={"position_mm": (8.0, -2.0, 2.0), "viewing_angle_deg": 60.0}))
+    panel = Light(position_mm=(5.8, 0.0, 0.7), aim_mm=(0.0, 0.0, 0.0), size_mm=(2.0, 1.0), color=(1, 1, 1), power=1e-9)
+    parts = tuple(light.model_copy(update={"power": light.power / 40}) for light in kinds for _ in range(40))
+    render = Render(samples_per_pixel=16, light="separated")
+    two, eighty = (rendered(small_sensor(lights=(*of, panel)), render=render)[..., 0] for of in (kinds, parts))
+    assert 0.02 < np.mean(two < 0.6 * np.median(two)) < 0.4
+    assert np.abs(two - eighty).max() < 0.07 * two.max()  # at a shadow's edge, as above
+
+
+@needs_llvm
 def test_second_bounce_is_path_tracings_with_less_noise_and_none_on_flat_gel() -> None:
     """What one bounce more adds, 0.05 % of the picture; the same seeds make it known to some per cent."""
     added = []

@@ -121,8 +121,8 @@ def _bits(numbers: np.ndarray) -> np.ndarray:
 
 
 def _single(numbers: wp.array) -> np.ndarray:
-    """Of bfloat16, whose bits NumPy gets."""
-    return (numbers.numpy().astype(np.uint32) << 16).view(np.float32)
+    """Of bfloat16, of which NumPy gets the bits, or the numbers where ml_dtypes is installed."""
+    return (numbers.numpy().view(np.uint16).astype(np.uint32) << 16).view(np.float32)
 
 
 @pytest.mark.filterwarnings("ignore:bfloat16 arrays")
