@@ -262,15 +262,10 @@ class SeparatedLight:
                     light = table.light(mi.UInt32(number - before))
                     return left & (left - 1), *add(light, mi.UInt32(number), *sums)
 
-                own = mask & self._below(after - first) & ~self._below(before - first)
+                own = mask & bits(before - first, after - first, mi)
                 _, *sums = dr.while_loop((own, *sums), lambda left, *_: left != 0, step)
             before = after
         return sums
-
-    def _below(self, count: Any) -> Any:
-        """A word of which the lowest bits (mi.Int32) are set, all or none where there are not as many."""
-        mi, dr = self._mi, self._dr
-        return dr.select(count >= _BITS, mi.UInt32(2**_BITS - 1), (mi.UInt32(1) << dr.clip(count, 0, _BITS - 1)) - 1)
 
     def _sampled(self, light: PolygonLight, number: Any, at: Any, normal: Any, offset: Any) -> Any:
         """Irradiance per radiance that a point of the light gives unless its ray is blocked, and whether it is."""
@@ -351,3 +346,13 @@ class SeparatedLight:
         straight, mirrored = self._gel.kinds(hit, mi.Bool(True))
         lit = self._gel.point(ray, hit, mirrored, straight | mirrored).wi.z < 0
         return ray, hit, lit & straight, lit & mirrored
+
+
+def bits(low: Any, high: Any, mi: Any) -> Any:
+    """A word (mi.UInt32) of which the bits from `low` to before `high` (mi.Int32) are set, those that it has."""
+    import drjit as dr
+
+    def below(count: Any) -> Any:
+        return dr.select(count >= _BITS, mi.UInt32(2**_BITS - 1), (mi.UInt32(1) << dr.clip(count, 0, _BITS - 1)) - 1)
+
+    return below(high) & ~below(low)

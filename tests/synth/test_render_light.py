@@ -14,6 +14,7 @@ from synth.render.gel_mesh import MIRROR
 from synth.render.lights import emitters, light_axes
 from synth.render.polygon_light import LightTable
 from synth.render.renderer import Renderer
+from synth.render.separated_light import bits
 from synth.scene import CapsuleGel, Coating, Light, Render, Sensor
 
 LIGHTS = tuple(Light(position_mm=(x, 1.0, 3.0), size_mm=(3, 1), color=(1, 1, 1), power=400) for x in (-7.0, 7.0))
@@ -115,6 +116,32 @@ def test_a_shadow_of_more_lights_than_a_word_has_bits() -> None:
     two, eighty = (rendered(small_sensor(lights=(*of, panel)), render=render)[..., 0] for of in (kinds, parts))
     assert 0.02 < np.mean(two < 0.6 * np.median(two)) < 0.4
     assert np.abs(two - eighty).max() < 0.07 * two.max()  # at a shadow's edge, as above
+
+
+@needs_llvm
+def test_bits_of_a_word() -> None:
+    mi = FAST.load()
+    for low, high in ((0, 3), (5, 32), (-40, 2), (31, 70), (0, 64), (-32, 0), (32, 40), (4, 4)):
+        expected = sum(1 << k for k in range(32) if low <= k < high)
+        assert int(bits(mi.Int32(low), mi.Int32(high), mi)[0]) == expected
+
+
+@needs_llvm
+def test_gel_that_no_light_reaches_lights_no_other() -> None:
+    """A light with a panel before it, over a bump that would bounce its light."""
+    light = Light(position_mm=(8.0, 2.0, 3.0), size_mm=(0.05, 0.05), color=(1, 1, 1), power=100)
+    panel = Light(position_mm=(7.9, 1.975, 2.9625), aim_mm=(0, 0, 0), size_mm=(3.0, 3.0), color=(1, 1, 1), power=1e-9)
+    bump = flat_surface(small_sensor()).material.copy()
+    bump[:, 2] += np.exp(-(bump[:, 0] ** 2 + bump[:, 1] ** 2) / 1.2**2)
+    lit, dark = small_sensor(lights=(light,)), small_sensor(lights=(light, panel))
+
+    def bounced(of: Sensor) -> float:
+        """The most that a reflection adds anywhere."""
+        renders = (Render(samples_per_pixel=16, light="separated", max_depth=depth) for depth in (3, 2))
+        more, less = (rendered(of, render=render, positions=bump) for render in renders)
+        return float((more - less).max())
+
+    assert bounced(dark) < 1e-3 * bounced(lit)
 
 
 @needs_llvm
