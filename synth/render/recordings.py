@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-_MOST = 8
+_MOST = 16
 """Recordings that are kept: every size of mesh and of picture has its own."""
 
 
