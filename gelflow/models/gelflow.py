@@ -20,6 +20,7 @@ from gelflow.hardware import has_bfloat16
 from gelflow.models import layers
 from gelflow.models.denoiser import Denoiser
 from gelflow.models.registration import registered
+from gelflow.models.specks import without_specks
 from gelflow.ops.correlation import local_correlation
 from gelflow.ops.pyramid import enlarge_flow
 from gelflow.ops.spline import SplineImage
@@ -96,6 +97,8 @@ class GelFlow(nn.Module):
         settings = self.config.registration
         if settings is None:
             return flow
+        if settings.background_px is not None:
+            image1 = without_specks(flow, image1, image2)
         second = SplineImage(image2.float())
         found = registered(flow, image1, second, settings)
         if self.denoiser is None or settings != RegistrationConfig():

@@ -21,18 +21,23 @@ from torch import Tensor
 from gelflow.arrays import Flow, Images
 from gelflow.models.evidence import TINY
 from gelflow.models.propagation import windowed_residual
-from gelflow.ops.gaussian import smoother, window_sums
+from gelflow.ops.gaussian import doubled, smoother, window_sums
 from gelflow.ops.pyramid import resize_images
+from gelflow.ops.warp import warp
 
 CELL_PX, RING_CELLS, INNER_PX, WIDTH_PX = 6, 6, 10.0, 18.0
 """The ring: side of the cells to which the flow is reduced, half its side, its inner radius, and the standard deviation
 of the Gaussian that weighs it."""
 STRIDE = 2
 """Cells from one fit to the next, along each axis."""
-NEAR_CELLS = 2
-"""How far specks draw the flow."""
+NEAR_CELLS, COVER_PX = 2, 4
+"""How far specks draw the flow, and how far beyond what is found of them they go."""
 WINDOW_PX, MAX_RATIO = 2.0, 0.2
 """Window in which images are compared, and the largest ratio of squared differences where one of them is none."""
+COVERED = 1.5, 0.35
+"""The same where the flow is known to move at specks."""
+MIN_GAIN = 0.03
+"""What the flow must explain around specks, as a mean of (still - left) / (still + left)."""
 MIN_CONTRAST, NOISE = 0.02, 0.002
 """Least contrast of a speck, and differences of images that are none; white is 1."""
 DOUBT = 0.1
@@ -45,14 +50,12 @@ FLOOR_PX, REWEIGHTINGS = 0.1, 6
 
 def speck_error(flow: Flow, image1: Images, image2: Images, texture: Tensor) -> Tensor:
     """E in px^2 near specks, else 0; (B, 1, H, W). `texture` is as of `Step`, 0 where it does not tell the flow."""
-    window, none = window_sums(flow, WINDOW_PX, 2), torch.zeros_like(flow)
-    still, left = (windowed_residual(each, image1, image2, window, True) for each in (none, flow))
-    contrast = windowed_residual(none, image1, torch.zeros_like(image2), window, True)
-    stands = (still < MAX_RATIO * contrast) & (contrast > MIN_CONTRAST**2) & (still < 2 * left + NOISE**2)
+    stands, still, left = _standing(flow, image1, image2, WINDOW_PX, MAX_RATIO)
+    stands &= still < 2 * left + NOISE**2
     texture, size = texture.clamp(min=0), (flow.shape[-2], flow.shape[-1])
     doubtful = F.interpolate(stands.float(), scale_factor=2.0)[..., : size[0], : size[1]] > 0
     motion, misfit = surroundings(flow, texture, torch.where(doubtful, DOUBT * texture, texture))
-    moved = windowed_residual(motion, image1, image2, window, True)
+    moved = windowed_residual(motion, image1, image2, window_sums(flow, WINDOW_PX, 2), True)
     at_places = smoother(flow, 0.0, 2)
     fast, drawn = (at_places(each).square().sum(dim=1, keepdim=True) for each in (motion, flow))
     speck = stands & (fast > MIN_MOTION_PX**2 + MISFITS**2 * at_places(misfit)) & (drawn < MAX_SHARE**2 * fast)
@@ -61,6 +64,38 @@ def speck_error(flow: Flow, image1: Images, image2: Images, texture: Tensor) -> 
     near = F.max_pool2d(near, 2 * NEAR_CELLS + 1, 1, NEAR_CELLS)
     error = (flow - motion).square().sum(dim=1, keepdim=True) + misfit
     return resize_images(near, size) * error
+
+
+def without_specks(flow: Flow, image1: Images, image2: Images) -> Images:
+    """Image 1 with what a flow finds in image 2 in place of specks, which then no longer draw registration to zero.
+
+    Here the flow itself moves at specks, as that of a network that was trained with them (`gelflow.training.specks`).
+    They are texture that stands still and differs under the flow, where most texture around it obeys the flow.
+    """
+    with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
+        flow, image1, image2 = flow.float(), image1.float(), image2.float()
+        stands, still, left = _standing(flow, image1, image2, *COVERED)
+        left = torch.where(left.isfinite(), left, still)  # nothing is known of what leaves the image
+        moves = smoother(flow, 0.0, 2)(flow).square().sum(dim=1, keepdim=True) > MIN_MOTION_PX**2
+        speck = stands & moves & (still < COVERED[1] * left)
+        reach = F.max_pool2d(speck.float(), COVER_PX + 1, 1, COVER_PX // 2)
+        gain = torch.where(reach > 0, 0.0, (still - left) / (still + left + MIN_CONTRAST**2))
+        obeyed = window_sums(gain, WIDTH_PX / 2)(gain - MIN_GAIN) > 0
+        covered = doubled(reach * obeyed)[..., : flow.shape[-2], : flow.shape[-1]] > 0
+        return torch.where(covered, warp(image2, flow), image1)
+
+
+def _standing(
+    flow: Flow, image1: Images, image2: Images, window_px: float, ratio: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Where texture stands still, up to that ratio, and the images' differences without motion and under the flow.
+
+    They are squared, means under a window, at every second px, (B, 1, h, w).
+    """
+    window, none = window_sums(flow, window_px, 2), torch.zeros_like(flow)
+    still, left = (windowed_residual(each, image1, image2, window, True) for each in (none, flow))
+    contrast = windowed_residual(none, image1, torch.zeros_like(image2), window, True)
+    return (still < ratio * contrast) & (contrast > MIN_CONTRAST**2), still, left
 
 
 def surroundings(flow: Flow, texture: Tensor, trusted: Tensor) -> tuple[Flow, Tensor]:

@@ -25,6 +25,7 @@ from gelflow.models import GelFlow
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.recorded import GraphedNetwork
 from gelflow.models.registration import registered
+from gelflow.models.specks import without_specks
 from gelflow.ops.warp import inside, warp
 
 LOG_EVERY = 10
@@ -125,6 +126,7 @@ class FlowModule(L.LightningModule):
         assert settings is not None
         with torch.no_grad(), torch.autocast(image1.device.type, enabled=False):
             network = model(image1, image2)[0]
+        image1 = without_specks(network, image1, image2)
         flow = registered(network, image1, image2, settings)
         return denoising_loss(model.denoiser, flow, network, image1, image2, truth)
 

@@ -1,5 +1,7 @@
 """Specks in the optics: sigma is raised where they draw the flow to zero, and nowhere else."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -7,8 +9,12 @@ from numpy.typing import NDArray
 from textures import grid, texture
 
 import gelflow
-from gelflow.models.specks import speck_error, surroundings
+from gelflow.config import LossConfig, ModelConfig, RegistrationConfig, TrainConfig
+from gelflow.models import GelFlow
+from gelflow.models.registration import registered
+from gelflow.models.specks import speck_error, surroundings, without_specks
 from gelflow.models.uncertainty import flow_sigma
+from gelflow.training.module import FlowModule
 
 HEIGHT, WIDTH, REACH_PX = 144, 192, 8.0
 PLACES = ((40, 45), (70, 100), (150, 40), (120, 100), (165, 115))
@@ -21,9 +27,8 @@ def motion(kind: str) -> tuple[Array, Array]:
     x, y = grid(HEIGHT, WIDTH)
     if kind == "turn":
         return 0.06 * (y - 150) + 3, -0.06 * (x - 96)
-    height = (
-        np.exp(-((x - 90) ** 2 + (y - 70) ** 2) / (2 * 45**2)) if kind == "press" else float(kind == "shift") + 0 * x
-    )
+    shift = {"shift": 1.0, "slow": 0.5, "creep": 0.1}.get(kind, 0.0)
+    height = np.exp(-((x - 90) ** 2 + (y - 70) ** 2) / (2 * 45**2)) if kind == "press" else shift + 0 * x
     return 3.0 * height, -2.0 * height
 
 
@@ -103,6 +108,55 @@ def test_where_specks_draw_the_flow_to_zero_it_is_uncertain(kind: str, moves: st
 def test_without_motion_or_without_specks_nothing_is_added(kind: str, moves: str, specks: str) -> None:
     image1, image2, truth, _ = pair(kind, moves, specks)
     assert speck_error(tensor(truth), tensor(image1), tensor(image2), torch.ones(1, 1, HEIGHT, WIDTH)).max() == 0
+
+
+def near_error(found: torch.Tensor, truth: Array, mask: Array) -> float:
+    error = np.linalg.norm(np.moveaxis(found[0].numpy(), 0, -1) - truth, axis=-1)
+    return float(error[distance_to(mask) <= REACH_PX].mean())
+
+
+@pytest.mark.parametrize("kind", ["dots", "waves"])
+@pytest.mark.parametrize("moves", ["shift", "slow"])
+@pytest.mark.parametrize("specks", ["disc", "dust", "bubble", "scratch"])
+def test_registration_keeps_a_flow_that_moves_at_specks(kind: str, moves: str, specks: str) -> None:
+    image1, image2, truth, mask = pair(kind, moves, specks)
+    images, flow = (tensor(image1), tensor(image2)), tensor(truth)
+    drawn = near_error(registered(flow, *images, RegistrationConfig()), truth, mask)
+    kept = near_error(registered(flow, without_specks(flow, *images), images[1], RegistrationConfig()), truth, mask)
+    assert kept < 0.1 < drawn
+
+
+def test_specks_side_by_side_do_not_speak_for_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    here, dots = sys.modules[__name__], gel
+    monkeypatch.setattr(here, "PLACES", ((86, 62), (96, 62), (106, 62), (86, 78), (96, 78), (106, 78)))
+    monkeypatch.setattr(here, "gel", lambda kind, x, y: dots(kind, x / 3, y / 3))
+    image1, image2, truth, mask = pair("dots", "slow", "disc")
+    found = without_specks(tensor(truth), tensor(image1), tensor(image2))
+    assert near_error(registered(tensor(truth), found, tensor(image2), RegistrationConfig()), truth, mask) < 0.1
+
+
+@pytest.mark.parametrize("kind", ["dots", "waves"])
+@pytest.mark.parametrize(
+    ("moves", "specks"), [("none", "disc"), ("creep", "disc"), ("shift", "none"), ("press", "none"), ("turn", "none")]
+)
+def test_where_nothing_stands_still_or_all_of_it_does_image_1_is_left(kind: str, moves: str, specks: str) -> None:
+    image1, image2, truth, _ = pair(kind, moves, specks)
+    for wrong in (0.0, 2.0) if moves == "none" else (0.0,):
+        assert torch.equal(without_specks(tensor(truth + wrong), tensor(image1), tensor(image2)), tensor(image1))
+
+
+def test_the_network_is_used_and_the_denoiser_trained_without_specks(monkeypatch: pytest.MonkeyPatch) -> None:
+    image1, image2, truth, mask = pair("waves", "shift", "disc")
+    images, flow = (tensor(image1), tensor(image2)), tensor(truth)
+    monkeypatch.setattr(GelFlow, "forward", lambda self, *_: [flow])
+    config = ModelConfig(levels=4, projected_channels=8, denoise=True, registration=RegistrationConfig())
+    assert near_error(GelFlow(config).flow(*images), truth, mask) < 0.3
+    module = FlowModule(
+        TrainConfig(model=config, supervision="registered", loss=LossConfig(lambda_s=[1, 1, 1])), GelFlow(config)
+    )
+    near = torch.from_numpy(distance_to(mask) <= REACH_PX)
+    _, parts = module._denoising(*images, torch.where(near, flow, torch.nan))
+    assert parts["registered"] < 0.3
 
 
 def test_the_surroundings_of_a_linear_flow_are_that_flow_whatever_a_fifth_of_it_says() -> None:
