@@ -171,9 +171,12 @@ def test_the_surroundings_of_a_linear_flow_are_that_flow_whatever_a_fifth_of_it_
     assert misfit[inner].max() < 1.0
 
 
-def test_the_network_is_uncertain_near_specks() -> None:
+def test_best_is_right_near_specks() -> None:
+    """It was trained with them; "fast", which was not, follows them."""
     image1, image2, truth, mask = pair("dots", "shift", "bubble")
-    found = gelflow.load_model("best", device="cpu").estimate(*(image.astype(np.float32) for image in (image1, image2)))
     near = distance_to(mask) <= REACH_PX
-    assert (np.linalg.norm(found.flow - truth, axis=-1) > 1)[near].mean() > 0.2, "the specks do nothing"
-    assert wrong_share(found.flow, truth, found.sigma, near) <= 0.05
+    models = (gelflow.load_model(name, device="cpu") for name in ("best", "fast"))
+    flows = (model.flow(image1.astype(np.float32), image2.astype(np.float32)) for model in models)
+    best, fast = ((np.linalg.norm(flow - truth, axis=-1) > 1)[near].mean() for flow in flows)
+    assert best < 0.05
+    assert fast > 0.2, "the specks do nothing"
