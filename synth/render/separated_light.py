@@ -38,6 +38,7 @@ from typing import Any
 from synth.render.albedo_map import AlbedoMap
 from synth.render.face_points import FacePoints, count_per_face, projected
 from synth.render.gel_hits import GelHits
+from synth.render.light_words import BITS, bits
 from synth.render.lights import image_lights, reaches, reflectance
 from synth.render.measured_light import LightModel, MeasuredLight
 from synth.render.polygon_light import LightTable, PolygonLight
@@ -54,8 +55,6 @@ _NEGLIGIBLE = 3e-3
 """Share of all light on a point up to which a light's shadows are not sampled."""
 _NODES, _PILOT_NODES = 14, 6
 """Points of a light without closed form for a pixel, and for a point of a face."""
-_BITS = 32
-"""Lights in a word of a face's mask."""
 _SHIFT = (0.7548776662466927, 0.5698402909980532)
 """Shift of shadow rays from one light to the next: R2 sequence (Roberts 2018), on a torus to keep the strata."""
 
@@ -110,7 +109,7 @@ class SeparatedLight:
             (images, {"sampled": True, "index": index}),
         ]
         self._lights = [LightTable(lights, albedo.channels, mi, **kind) for lights, kind in kinds if lights]
-        self._words = -(-(len(own) + len(images)) // _BITS)
+        self._words = -(-(len(own) + len(images)) // BITS)
 
     @property
     def static(self) -> tuple[Any, ...]:
@@ -253,7 +252,7 @@ class SeparatedLight:
         for table in self._lights:
             after = before + mi.Int32(table.count)
             for word, mask in enumerate(masks):
-                first = _BITS * word
+                first = BITS * word
 
                 def step(
                     left: Any, *sums: Any, table: LightTable = table, before: Any = before, first: int = first
@@ -295,9 +294,9 @@ class SeparatedLight:
             value, blocked = self._sampled(light, number, at, normal, offset)
             lost = [dr.select(blocked, value * color, 0) for color in light.radiance]
             counts = reduce(or_, (less > _NEGLIGIBLE * total for less, total in zip(lost, whole, strict=True)))
-            bit = dr.select(counts, mi.UInt32(1) << (number % _BITS), 0)
+            bit = dr.select(counts, mi.UInt32(1) << (number % BITS), 0)
             left = [sum_ - less for sum_, less in zip(sums[self._words :], lost, strict=True)]
-            masks = [m | dr.select(number // _BITS == word, bit, 0) for word, m in enumerate(sums[: self._words])]
+            masks = [m | dr.select(number // BITS == word, bit, 0) for word, m in enumerate(sums[: self._words])]
             return [*masks, *left]
 
         found = self._over_lights(mark, [mi.UInt32(0) for _ in range(self._words)] + whole)
@@ -346,13 +345,3 @@ class SeparatedLight:
         straight, mirrored = self._gel.kinds(hit, mi.Bool(True))
         lit = self._gel.point(ray, hit, mirrored, straight | mirrored).wi.z < 0
         return ray, hit, lit & straight, lit & mirrored
-
-
-def bits(low: Any, high: Any, mi: Any) -> Any:
-    """A word (mi.UInt32) of which the bits from `low` to before `high` (mi.Int32) are set, those that it has."""
-    import drjit as dr
-
-    def below(count: Any) -> Any:
-        return dr.select(count >= _BITS, mi.UInt32(2**_BITS - 1), (mi.UInt32(1) << dr.clip(count, 0, _BITS - 1)) - 1)
-
-    return below(high) & ~below(low)

@@ -11,10 +11,10 @@ from round_gels import RADIUS, SPHERE, capsule, sensor
 from synth.arrays import FloatArray
 from synth.render.camera_rays import pinhole
 from synth.render.gel_mesh import MIRROR
+from synth.render.light_words import bits
 from synth.render.lights import emitters, light_axes
 from synth.render.polygon_light import LightTable
 from synth.render.renderer import Renderer
-from synth.render.separated_light import bits
 from synth.scene import CapsuleGel, Coating, Light, Render, Sensor
 
 LIGHTS = tuple(Light(position_mm=(x, 1.0, 3.0), size_mm=(3, 1), color=(1, 1, 1), power=400) for x in (-7.0, 7.0))
