@@ -268,14 +268,11 @@ class SeparatedLight:
 
     def _sampled(self, light: PolygonLight, number: Any, at: Any, normal: Any, offset: Any) -> Any:
         """Irradiance per radiance that a point of the light gives unless its ray is blocked, and whether it is."""
-        place, value = self._point(light, number, at, normal, offset)
-        return value, self._scene.ray_test(at.spawn_ray_to(place), value > 0)
-
-    def _point(self, light: PolygonLight, number: Any, at: Any, normal: Any, offset: Any) -> Any:
         mi, dr = self._mi, self._dr
         moved = mi.Point2f(offset) + mi.Float(number) * mi.Point2f(*_SHIFT)
-        place, value = light.sample(at.p, moved - dr.floor(moved))
-        return place, dr.maximum(dr.dot(value, normal), 0)
+        place, vector = light.sample(at.p, moved - dr.floor(moved))
+        value = dr.maximum(dr.dot(vector, normal), 0)
+        return value, self._scene.ray_test(at.spawn_ray_to(place), value > 0)
 
     def _pilots(self, seed: Any, faces: int) -> tuple[list[Any], list[Any], Any]:
         """What rays from all faces find out.
