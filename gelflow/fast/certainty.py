@@ -2,8 +2,8 @@
 
 As `gelflow.models.evidence`, `gelflow.models.wider_window` and `gelflow.models.uncertainty`, which hold the equations,
 with two differences. What the flow misses is the Gauss-Newton step that is left. Where the flow leaves more than
-`UNEXPLAINED` of what unrelated images would, and more than the camera's noise, it has lost the pattern. Specks in the
-optics are not looked for.
+`UNEXPLAINED` of what unrelated images would, and more than the camera's noise, it has lost the pattern. Near specks in
+the optics, sigma is raised (`gelflow.fast.specks`).
 
 Dots taken for the next ones explain the images, all but at the edge of the place where they were taken. So the picture
 is cut where images differ, where nothing is known, and where the flow strains the gel much, as between two dots of
@@ -33,6 +33,7 @@ from gelflow.fast.registration import (
     slopes,
     unexplained,
 )
+from gelflow.fast.specks import speck_error
 from gelflow.fast.start import TORN
 from gelflow.models.evidence import MAX_VARIANCE, solved
 from gelflow.models.registration import posterior_variance
@@ -117,6 +118,8 @@ def refined(flow: FlowArray, first: Prepared, second: Prepared, before: Refined 
     square = RADIUS**2 / 2 * (error + (CURVATURE * CELL**2 * moment).square() * curvature_square(best, CELL))
     fitted, sigma = best[0].movedim(0, -1).contiguous().numpy(), square.clamp(max=MAX_SIGMA_PX**2).sqrt()[0, 0].numpy()
     trusted, lost, torn = _parts(fitted, sigma, first, second, before)
+    specks = speck_error(fitted, torch.where(known, textured, 0.0)[0, 0].numpy(), first, second)
+    sigma = np.sqrt(sigma**2 + RADIUS**2 / 2 * specks).clip(max=MAX_SIGMA_PX)
     return Refined(fitted, np.where(trusted, sigma, np.float32(MAX_SIGMA_PX)), trusted, lost, torn)
 
 

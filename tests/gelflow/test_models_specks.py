@@ -9,7 +9,10 @@ from numpy.typing import NDArray
 from textures import grid, texture
 
 import gelflow
+from gelflow.arrays import Estimate
 from gelflow.config import LossConfig, ModelConfig, RegistrationConfig, TrainConfig
+from gelflow.fast import certainty
+from gelflow.fast.specks import speck_error as fast_speck_error
 from gelflow.models import GelFlow
 from gelflow.models.registration import registered
 from gelflow.models.specks import speck_error, surroundings, without_specks
@@ -28,7 +31,10 @@ def motion(kind: str) -> tuple[Array, Array]:
     if kind == "turn":
         return 0.06 * (y - 150) + 3, -0.06 * (x - 96)
     shift = {"shift": 1.0, "slow": 0.5, "creep": 0.1}.get(kind, 0.0)
-    height = np.exp(-((x - 90) ** 2 + (y - 70) ** 2) / (2 * 45**2)) if kind == "press" else shift + 0 * x
+    square = (x - 90) ** 2 + (y - 70) ** 2
+    height = np.exp(-square / (2 * 45**2)) if kind == "press" else shift + 0 * x
+    if kind == "around":
+        height = 1 - np.exp(-square / (2 * 16**2))
     return 3.0 * height, -2.0 * height
 
 
@@ -108,6 +114,38 @@ def test_where_specks_draw_the_flow_to_zero_it_is_uncertain(kind: str, moves: st
 def test_without_motion_or_without_specks_nothing_is_added(kind: str, moves: str, specks: str) -> None:
     image1, image2, truth, _ = pair(kind, moves, specks)
     assert speck_error(tensor(truth), tensor(image1), tensor(image2), torch.ones(1, 1, HEIGHT, WIDTH)).max() == 0
+
+
+def fast_with_specks(image1: Array, image2: Array, monkeypatch: pytest.MonkeyPatch) -> tuple[Estimate, Array]:
+    """The estimate of "fast", and the error that it adds near specks, (H, W) px^2."""
+    added = []
+    monkeypatch.setattr(certainty, "speck_error", lambda *of: added.append(fast_speck_error(*of)) or added[-1])
+    found = gelflow.load_model("fast").estimate(image1.astype(np.float32), image2.astype(np.float32))
+    return found, added[0].repeat(4, axis=0).repeat(4, axis=1)
+
+
+@pytest.mark.parametrize("kind", ["dots", "waves"])
+@pytest.mark.parametrize("moves", ["shift", "press"])
+@pytest.mark.parametrize("specks", ["disc", "dust", "bubble"])
+def test_where_specks_draw_fast_its_sigma_says_so(kind: str, moves: str, specks: str, monkeypatch) -> None:
+    image1, image2, truth, mask = pair(kind, moves, specks)
+    found, added = fast_with_specks(image1, image2, monkeypatch)
+    distance = distance_to(mask)
+    wrong = (np.linalg.norm(found.flow - truth, axis=-1) > 1) & (distance <= REACH_PX)
+    assert wrong.sum() > 100, "the specks do nothing"
+    assert (found.sigma[wrong] < 0.5).mean() <= 0.05
+    # A cell of 4 px sees 6 px around its centre, and raises two cells around it, 10 px: 16 px along each axis.
+    assert added[distance > 16 * np.sqrt(2) + 1].max() == 0
+
+
+@pytest.mark.parametrize("kind", ["dots", "waves"])
+@pytest.mark.parametrize(
+    ("moves", "specks"),
+    [("none", "disc"), ("shift", "none"), ("press", "none"), ("turn", "none"), ("around", "none")],
+)
+def test_without_motion_or_without_specks_fast_adds_nothing(kind: str, moves: str, specks: str, monkeypatch) -> None:
+    image1, image2, _, _ = pair(kind, moves, specks)
+    assert fast_with_specks(image1, image2, monkeypatch)[1].max() == 0
 
 
 def near_error(found: torch.Tensor, truth: Array, mask: Array) -> float:
