@@ -192,7 +192,7 @@ class RefinementHead(nn.Module):
                 both = fused.side_by_side(first, second, flow)
                 costs = fused.costs(both, none, none + 1 / first.shape[1], REFINEMENT_RADIUS, SLOPE)
             else:
-                costs = first.shape[1] * local_correlation(first, warp(second, flow), REFINEMENT_RADIUS)
+                costs = local_correlation(first.shape[1] * first, warp(second, flow), REFINEMENT_RADIUS)
                 costs = F.leaky_relu(costs, SLOPE, inplace=not torch.is_grad_enabled())
             evidence = torch.cat([part.to(encoded.dtype) for part in (costs, first, flow)], dim=1)
             flow = flow + self.head(self.layers(evidence)).float()

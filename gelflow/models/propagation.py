@@ -89,17 +89,24 @@ def propagated(flow: Flow, image1: Images, image2: Images, window_px: float, con
 
 
 def windowed_residual(
-    flow: Flow, image1: Images, image2: Images, window: SeparableFilter, ignore_shading: bool
+    flow: Flow | None, image1: Images, image2: Images, window: SeparableFilter, ignore_shading: bool
 ) -> Tensor:
-    """E at each pixel, (N, 1, H, W), of N flows of B pairs in turn; infinite where too little of a window is inside."""
-    whole = window(torch.ones_like(flow[:1, :1]))
-    if flow.is_cuda and ignore_shading:
+    """E at each pixel, (N, 1, H, W), of N flows of B pairs in turn; infinite where too little of a window is inside.
+
+    Without a flow, that of images that do not move.
+    """
+    whole = window(torch.ones_like(image1[:1, :1]))
+    if image1.is_cuda and ignore_shading:
         from gelflow.models import fused_registration as fused
 
+        flow = torch.zeros_like(image1[:, :2]) if flow is None else flow
         return fused.spread(window(fused.residual_terms(flow, image1, image2)), whole, MIN_SHARE_INSIDE)
-    image1, image2 = (i.expand(len(flow) // len(i), *i.shape).flatten(0, 1) for i in (image1, image2))
-    counts = inside(flow)
-    left = counts * (warp(image2, flow) - image1)
+    if flow is None:
+        counts, left = torch.ones_like(image1[:, :1]), image2 - image1
+    else:
+        image1, image2 = (i.expand(len(flow) // len(i), *i.shape).flatten(0, 1) for i in (image1, image2))
+        counts = inside(flow)
+        left = counts * (warp(image2, flow) - image1)
     squares = left.square().mean(dim=1, keepdim=True)
     sums = window(torch.cat([counts, squares, left] if ignore_shading else [counts, squares], dim=1))
     weight = sums[:, :1]

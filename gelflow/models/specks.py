@@ -78,6 +78,8 @@ def without_specks(flow: Flow, image1: Images, image2: Images) -> Images:
         left = torch.where(left.isfinite(), left, still)  # nothing is known of what leaves the image
         moves = smoother(flow, 0.0, 2)(flow).square().sum(dim=1, keepdim=True) > MIN_MOTION_PX**2
         speck = stands & moves & (still < COVERED[1] * left)
+        if not flow.is_cuda and not speck.any():  # a recorded CUDA graph cannot choose
+            return image1
         reach = F.max_pool2d(speck.float(), COVER_PX + 1, 1, COVER_PX // 2)
         gain = torch.where(reach > 0, 0.0, (still - left) / (still + left + MIN_CONTRAST**2))
         obeyed = window_sums(gain, WIDTH_PX / 2)(gain - MIN_GAIN) > 0
@@ -92,9 +94,9 @@ def _standing(
 
     They are squared, means under a window, at every second px, (B, 1, h, w).
     """
-    window, none = window_sums(flow, window_px, 2), torch.zeros_like(flow)
-    still, left = (windowed_residual(each, image1, image2, window, True) for each in (none, flow))
-    contrast = windowed_residual(none, image1, torch.zeros_like(image2), window, True)
+    window = window_sums(flow, window_px, 2)
+    still, left = (windowed_residual(each, image1, image2, window, True) for each in (None, flow))
+    contrast = windowed_residual(None, image1, torch.zeros_like(image2), window, True)
     return (still < ratio * contrast) & (contrast > MIN_CONTRAST**2), still, left
 
 

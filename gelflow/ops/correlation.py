@@ -71,13 +71,13 @@ def _by_channels(first: Tensor, second: Tensor, radius: int) -> Tensor:
     """Channel by channel, in strips of rows that stay in a processor's cache."""
     batch, channels, height, width = first.shape
     side = 2 * radius + 1
-    costs = first.new_zeros(batch, side, side, height, width)
+    first, costs = first / channels, first.new_empty(batch, side, side, height, width)
     windows = F.pad(second, (radius,) * 4).unfold(2, height, 1).unfold(3, width, 1)
     for top in range(0, height, ROWS):
-        rows = slice(top, top + ROWS)
-        for channel in range(channels):
-            costs[..., rows, :].addcmul_(first[:, channel, None, None, rows], windows[:, channel, ..., rows, :])
-    return costs.div_(channels).flatten(1, 2)
+        strip = costs[..., top : top + ROWS, :].zero_()
+        for here, there in zip(first[..., top : top + ROWS, :].unbind(1), windows.unbind(1), strict=True):
+            strip.addcmul_(here[:, None, None], there[..., top : top + ROWS, :])
+    return costs.flatten(1, 2)
 
 
 def _by_blocks(first: Tensor, second: Tensor, radius: int) -> Tensor:

@@ -32,7 +32,7 @@ class SeparableFilter(NamedTuple):
 
     def __call__(self, field: Features) -> Features:
         """Filters each channel of (B, C, H, W)."""
-        if self.kernel is None or not _is_array(field):
+        if self.kernel is None or not is_array(field):
             return self.down @ field @ self.across.T
         rows, columns = len(self.down), len(self.across)
         sums = field.new_empty(*field.shape[:2], rows, columns)
@@ -46,7 +46,7 @@ class SeparableFilter(NamedTuple):
 
 def doubled(cells: Features) -> Features:
     """A field on cells of 2 x 2 px (B, C, h, w) at each pixel, (B, C, 2 h, 2 w), bilinear."""
-    if not _is_array(cells):
+    if not is_array(cells):
         return F.interpolate(cells, scale_factor=2.0, mode="bilinear")
     rows, columns = 2 * cells.shape[-2], 2 * cells.shape[-1]
     finer = cells.new_empty(*cells.shape[:2], rows, columns)
@@ -55,7 +55,7 @@ def doubled(cells: Features) -> Features:
     return finer
 
 
-def _is_array(field: Tensor) -> bool:
+def is_array(field: Tensor) -> bool:
     """Whether OpenCV can compute on it."""
     return field.device.type == "cpu" and field.dtype == torch.float32 and not field.requires_grad
 

@@ -10,21 +10,28 @@ Hadwiger, "Fast third-order texture filtering", GPU Gems 2, 2005.
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable
 
+import cv2
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from gelflow.arrays import Features
 from gelflow.ops.cached import cached
+from gelflow.ops.gaussian import is_array
 
 MARGIN = 2
 """Coefficients beyond each border: a cubic B-spline reaches two px."""
 POLE = math.sqrt(3) - 2
 """Pole of the filter from samples to coefficients, whose response to one pixel is sqrt(3) POLE^|distance|."""
-
+RESPONSE = (math.sqrt(3) * POLE ** np.abs(np.arange(-14, 15))).astype(np.float32)
+"""That response, as far as it is more than 1e-8."""
+QUARTER = np.array([1, 121, 235, 27]) / 384
+"""The B-spline at 7, 3, 1 and 5 quarters: weights of the coefficients a quarter of a pixel before the third."""
 NOTHING = 1e-20
 """Responses of the filter that count as zero."""
 
@@ -45,7 +52,17 @@ class SplineImage:
 
     @functools.cached_property
     def _quarters(self) -> Features:
-        return self._along_axes(_to_quarters)
+        if not is_array(self.image):
+            return self._along_axes(_to_quarters)
+        kernels = [np.pad(QUARTER, (0, 1)).astype(np.float32), np.pad(QUARTER[::-1], (1, 0)).astype(np.float32)]
+        quarters = self.image.new_empty(*self.image.shape[:2], *(2 * side for side in self._size))
+        planes = self.image.contiguous().flatten(0, 1).numpy()
+        for plane, out in zip(planes, quarters.flatten(0, 1).numpy(), strict=True):
+            coefficients = cv2.sepFilter2D(plane, -1, RESPONSE, RESPONSE, borderType=cv2.BORDER_REFLECT_101)
+            for i, j in itertools.product((0, 1), repeat=2):
+                quarter = cv2.sepFilter2D(coefficients, -1, kernels[j], kernels[i], borderType=cv2.BORDER_REFLECT_101)
+                out[i::2, j::2] = quarter
+        return quarters
 
     def _along_axes(self, matrix: Callable[[int, torch.dtype, torch.device], Tensor]) -> Features:
         down, across = (matrix(pixels, self.image.dtype, self.image.device) for pixels in self._size)
@@ -115,7 +132,7 @@ def _to_quarters(pixels: int, dtype: torch.dtype, device: torch.device) -> Tenso
     coefficients = _prefilter(pixels, torch.float64, device)
     coefficients = F.pad(coefficients.T[None], (MARGIN, MARGIN), mode="reflect")[0].T
     near = coefficients.unfold(0, 4, 1)  # (n + 1, n, 4), the first of them before the first pixel
-    weights = torch.tensor([1, 121, 235, 27], dtype=torch.float64, device=device) / 384  # at 7, 3, 1 and 5 quarters
+    weights = torch.from_numpy(QUARTER).to(device)
     return torch.stack([near[:-1] @ weights, near[1:] @ weights.flip(0)], dim=1).flatten(0, 1).to(dtype)
 
 

@@ -142,6 +142,14 @@ def test_between_places_at_a_spacing_fields_are_interpolated_and_near_reads_the_
         torch.testing.assert_close(spline.near(at)[inner], spline.at(at)[inner], rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("size", [(3, 4), (17, 24)])
+def test_opencvs_values_between_pixels_are_those_of_the_splines_matrices(size: tuple[int, int]) -> None:
+    image = torch.rand(2, *size, 3, generator=torch.Generator().manual_seed(0)).movedim(-1, 1)
+    exact = SplineImage(image.double())._quarters
+    # The filter is cut where it has fallen to 1e-8, and its sums are rounded at 1e-7.
+    torch.testing.assert_close(SplineImage(image)._quarters.double(), exact, rtol=0, atol=2e-6)
+
+
 def test_both_orders_of_the_correlation_agree() -> None:
     first, second = torch.rand(2, 2, 3, 7, 45, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     expected = _unfolded(first, second, 2)
