@@ -8,14 +8,11 @@ The trajectories of one sensor are handed on together: its renderer is worth as 
 for one of their sensor's are a few hundred kilobytes each.
 """
 
-import os
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from functools import partial
 from itertools import count, islice
-
-import warp as wp
 
 from synth.pipeline.attempts import Attempt, Attempts
 from synth.pipeline.pads import Pads, pad_key
@@ -25,6 +22,7 @@ from synth.sampling import SensorInstance, draw_sensor, sensor_of
 from synth.scene import Gel, MeshIndenter
 from synth.scene.template import Template
 from synth.simulate.batched import simulate_presses
+from synth.simulate.batched.pad import load_kernels
 from synth.simulate.batched.run import Asked
 
 BATCH = {"cuda": 256, "cpu": 8}
@@ -67,8 +65,8 @@ class _Simulation:
         self.open: Counter[int] = Counter()
 
     def __iter__(self) -> Iterator[tuple[int, Result]]:
-        if self._context.plan.device == "cuda":  # on a new machine several modules compile at once
-            wp.load_module("synth.simulate", "cuda", recursive=True, max_workers=os.cpu_count() or 1)
+        if self._context.plan.device == "cuda":
+            load_kernels()
         with closing(self._firsts):
             yield from self._results()
 

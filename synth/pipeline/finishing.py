@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from synth.arrays import Image
 from synth.dataset.images import Raster
@@ -40,6 +41,12 @@ LEAST_GEL = 0.5
 """Share of pixels that show gel, below which images are warned of."""
 LOOKED_AT = 64
 """Trajectories, from the first one on, whose images are looked at for a warning, which is given once."""
+
+
+def load_kernels(device: str) -> None:
+    """Load what finishing needs of Warp; on a new machine it is compiled."""
+    wp.load_module("synth.press.measure", "cpu")
+    wp.load_module("synth.flow.trace", device)
 
 
 def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:

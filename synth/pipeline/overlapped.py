@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from synth.pipeline.batched_simulation import Result, in_batches
-from synth.pipeline.finishing import finish
+from synth.pipeline.finishing import finish, load_kernels
 from synth.pipeline.records import JobContext, Outcome, Task
 from synth.pipeline.render_session import RenderSession
 from synth.pipeline.worker_pool import Maker, render_on_one_core, spread
@@ -78,6 +78,7 @@ def _finisher_on_one_core(context: JobContext) -> Maker[list[Result], Outcome]:
     session = RenderSession(context)
     if context.plan.variant.is_on_gpu:
         session.warm_up()
+        load_kernels(context.plan.device)
     return _finisher(context, session)
 
 

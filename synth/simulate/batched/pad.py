@@ -7,6 +7,8 @@ precision, on CUDA by cuSOLVER, and applied in bfloat16 (`synth.simulate.batched
 a little with its argument, which flexible GMRES allows for.
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,12 +20,24 @@ from synth.press.indenter import RigidBody
 from synth.press.load_path import LoadPath
 from synth.press.resolution import ELEMENTS
 from synth.scene import Scene
-from synth.simulate.batched.gpu import Dense, dense, inverse
+from synth.simulate.batched.gpu import Dense, inverse
 from synth.simulate.contact_friction import Indenters
 from synth.simulate.material import Material, pad_material
 from synth.simulate.space import Space, function_space
 from synth.simulate.system import System
 from synth.simulate.tables import pack_indenter, place_indenter
+
+ON_HOST = ("contact_friction", "inversion_barrier", "stiffness")
+"""Modules whose kernels on the CPU find the undeformed pad's stiffness for a GPU."""
+
+
+def load_kernels() -> None:
+    """Load what simulation on a GPU needs of Warp; on a new machine modules are compiled, all at once."""
+    with ThreadPoolExecutor() as threads:
+        beside = [threads.submit(wp.load_module, f"synth.simulate.{name}", "cpu") for name in ON_HOST]
+        wp.load_module("synth.simulate", "cuda", recursive=True, max_workers=os.cpu_count() or 1)
+        for each in beside:
+            each.result()
 
 
 def stiffness(system: System, away: Indenters) -> scipy.sparse.csr_array:
@@ -43,7 +57,8 @@ class Pad:
 
     Attributes:
         free: (k,) numbers of the unknowns not held, displacements first.
-        inverse: (rows, rows) K_0^{-1} on the device, of `synth.simulate.batched.gpu.inverse`; `dense` applies it.
+        inverse: (rows, rows) K_0^{-1} on the device, of `synth.simulate.batched.gpu.inverse`.
+        products: what applies it; None for the Warp device's own.
     """
 
     scene: Scene
@@ -51,7 +66,7 @@ class Pad:
     material: Material
     free: np.ndarray
     inverse: wp.array
-    dense: Dense
+    products: Dense | None
     device: str
 
     @property
@@ -66,15 +81,14 @@ class Pad:
 def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = None) -> Pad:
     """Prepare the pad of a scene, for all scenes of the same mesh, materials and element.
 
-    `products` apply the preconditioner; by default they are the Warp device's own. InputError for CUDA without cuBLAS
-    or cuSOLVER.
+    InputError for CUDA without cuBLAS or cuSOLVER.
     """
     check_mesh(mesh)
     material = pad_material(scene.sensor.gel, mesh)
     space = function_space(mesh, ELEMENTS[scene.numerics.element]())
     system = System(space, material)
     matrix = inverse(stiffness(system, _away(scene)), device)
-    return Pad(scene, space, material, system.free, matrix, products or dense(device), device)
+    return Pad(scene, space, material, system.free, matrix, products, device)
 
 
 def _away(scene: Scene) -> Indenters:

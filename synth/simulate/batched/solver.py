@@ -12,6 +12,8 @@ another equilibrium (docs/reports/batched_fem.md, Rounding).
 """
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,7 @@ from synth.press.press import Press
 from synth.simulate.batched import fields, lane_orders, reductions
 from synth.simulate.batched import krylov as gmres
 from synth.simulate.batched.arrays import BatchArrays, single_tables
+from synth.simulate.batched.gpu import dense
 from synth.simulate.batched.lane_orders import Order
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.presses import PressTable, padded
@@ -41,6 +44,8 @@ from synth.simulate.multipliers import augment, update_contact_history
 from synth.simulate.stiffness import viscous_force
 from synth.simulate.tables import barrier_tables, bulk_tables, face_tables, nodal_weights, struct_of
 
+THREADS = 256
+"""Of a block, if a kernel does not ask for another number."""
 INNER_ITERATIONS = 8
 """Krylov iterations of a cycle: a solve that ends within them waits for their end, on average half of them."""
 
@@ -74,9 +79,26 @@ class BatchedSolver:
         cuda = wp.get_device(device).is_cuda
         self._seen = wp.empty_like(self._arrays.seen, device="cpu", pinned=cuda)
         self._ended = wp.Event(device) if cuda else None
-        self._aside = wp.Stream(device) if cuda else None
+        self._stream, self._aside = (wp.Stream(device) if cuda else None for _ in range(2))
+        self._dense = pad.products or dense(device)
+        if cuda:
+            self._load_own_kernels()
+            wp.synchronize_device(device)
 
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], *arguments: Any, block: int = 256) -> None:
+    def _load_own_kernels(self) -> None:
+        """On a new machine they are compiled, all at once."""
+        flat = ((self._product, BLOCK), (self._contact_product, THREADS))
+        tiled = ((kernel, self._block) for kernel in (self._arnoldi, self._solution))
+        with ThreadPoolExecutor() as threads:
+            load = partial(wp.load_module, device=self.device)
+            for each in [threads.submit(load, kernel.module, block_dim=block) for kernel, block in (*flat, *tiled)]:
+                each.result()
+
+    def _scope(self) -> wp.ScopedStream:
+        """Work on the solver's own stream, so that a GPU may do it beside another solver's."""
+        return wp.ScopedStream(self._stream, sync_enter=False)
+
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], *arguments: Any, block: int = THREADS) -> None:
         wp.launch(kernel, dim, inputs=list(arguments), device=self.device, block_dim=block)
 
     def _launch_blocks(self, kernel: wp.Kernel, block: int, *arguments: Any) -> None:
@@ -89,16 +111,17 @@ class BatchedSolver:
         orders: (B,) sets of `lane_orders.Order`; numbers: (B, k) by the columns of `lane_orders.Number`.
         """
         a = self._arrays
-        a.orders.assign(orders)
-        a.numbers.assign(numbers)
-        self._wanted = int(np.bitwise_or.reduce(orders))
-        self._end_solves()
-        self._begin_steps()
-        self._launch(lane_orders.place_indenters, self.batch, a.orders, a.numbers, self._presses, a.indenters)
-        self._solve_and_evaluate()
-        wp.copy(self._seen, a.seen)
-        if self._ended is not None:
-            wp.get_stream(self.device).record_event(self._ended)
+        with self._scope():
+            a.orders.assign(orders)
+            a.numbers.assign(numbers)
+            self._wanted = int(np.bitwise_or.reduce(orders))
+            self._end_solves()
+            self._begin_steps()
+            self._launch(lane_orders.place_indenters, self.batch, a.orders, a.numbers, self._presses, a.indenters)
+            self._solve_and_evaluate()
+            wp.copy(self._seen, a.seen)
+            if self._stream is not None:
+                self._stream.record_event(self._ended)
 
     def seen(self) -> FloatArray:
         """Wait for the end of the cycle; (B, k) what the lanes have seen, by the columns of `lane_orders.Seen`."""
@@ -218,11 +241,11 @@ class BatchedSolver:
 
     def _precondition(self) -> None:
         k = self.krylov
-        self.pad.dense.product(self.pad.inverse, gmres.flat(k.current), gmres.flat(k.preconditioned), k.running)
+        self._dense.product(self.pad.inverse, gmres.flat(k.current), gmres.flat(k.preconditioned), k.running)
 
     def _multiply(self) -> None:
         """The tangent times the preconditioned vectors."""
-        a, k, elements, transpose = self._arrays, self.krylov, self._element_dim[::-1], self.pad.dense.transpose
+        a, k, elements, transpose = self._arrays, self.krylov, self._element_dim[::-1], self._dense.transpose
         transpose(gmres.flat(k.preconditioned), k.corrected)
         k.image.zero_()
         found = (a.stored, k.corrected, k.image)
@@ -236,18 +259,19 @@ class BatchedSolver:
 
     def fill(self, presses: Mapping[int, Press]) -> None:
         """Begin presses, by lane."""
-        a, indenters = self._arrays, self._arrays.indenters
+        a, indenters, grids = self._arrays, self._arrays.indenters, self._arrays.indenters.coefficients
         untouched = (a.fields.state, a.fields.previous, a.contact.normal, a.contact.tangent, a.contact.anchored)
-        for s, press in presses.items():
-            self._table.put(s, press)
-            for values in untouched:
-                values[s].zero_()
-            a.contact.gap[s].fill_(FAR)
-            if indenters.coefficients.size > self.batch:
-                indenters.coefficients[s].assign(padded(press.path.body.coefficients, indenters.coefficients.shape[1:]))
-        self._presses = self._table.on_device()
-        indenters.kind.assign(self._table.kind)
-        indenters.shape.assign(self._table.shape)
+        with self._scope():
+            for s, press in presses.items():
+                self._table.put(s, press)
+                for values in untouched:
+                    values[s].zero_()
+                a.contact.gap[s].fill_(FAR)
+                if grids.size > self.batch:
+                    grids[s].assign(padded(press.path.body.coefficients, grids.shape[1:]))
+            self._presses = self._table.on_device()
+            indenters.kind.assign(self._table.kind)
+            indenters.shape.assign(self._table.shape)
 
     def recorded(self, lane: int, count: int) -> FloatArray:
         """The first states that a lane has recorded, a copy: its next press writes into the same memory.
