@@ -1,7 +1,8 @@
 """Flow between images of any size by a trained network: resize, estimate, resize the flow back."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,6 +22,7 @@ DIFFERENT = 0.1
 taken dots for their neighbours, which sigma does not tell. Then the flow that closes on more of the picture is kept."""
 
 
+Found = TypeVar("Found")
 Run = Callable[..., tuple[Tensor, ...]]
 """Calls a function with arguments, such as `gelflow.models.recorded.Recorder`."""
 
@@ -74,15 +76,38 @@ def _call(function: Run, *arguments: Any) -> tuple[Tensor, ...]:
 
 def flows_at(model: GelFlow, sizes: Sequence[tuple[int, int]], image1: Images, image2: Images) -> tuple[Flow, ...]:
     """The flow at each size, px of the images as they are given."""
-    native = (image1.shape[-2], image1.shape[-1])
-    reduced = ((resize_images(image1, size), resize_images(image2, size)) for size in sizes)
-    return tuple(resize_flow(model.flow(*images), native) for images in reduced)
+    return tuple(_side_by_side([partial(_flow_at, model, size, image1, image2) for size in sizes], image1.is_cuda))
+
+
+def _flow_at(model: GelFlow, size: tuple[int, int], image1: Images, image2: Images) -> Flow:
+    reduced = model.flow(resize_images(image1, size), resize_images(image2, size))
+    return resize_flow(reduced, (image1.shape[-2], image1.shape[-1]))
+
+
+def _side_by_side(calls: Sequence[Callable[[], Found]], cuda: bool) -> list[Found]:
+    """What calls give. A GPU, of which the kernels of one leave most idle, makes them at once, on streams."""
+    if not cuda:
+        return [call() for call in calls]
+    here, asides = torch.cuda.current_stream(), [torch.cuda.Stream() for _ in calls[1:]]
+    found = []
+    for call, aside in zip(calls[1:], asides, strict=True):
+        aside.wait_stream(here)
+        with torch.cuda.stream(aside):
+            found.append(call())
+    found.insert(0, calls[0]())
+    for aside in asides:
+        here.wait_stream(aside)
+    return found
 
 
 def _surest(model: GelFlow, sizes: Sequence[tuple[int, int]], image1: Images, image2: Images) -> tuple[Tensor, ...]:
     """The flow at each of two sizes; per pair, which one has the least mean of sigma, and whether they differ much."""
-    flows = flows_at(model, sizes, image1, image2)
-    sigmas = [sized_sigma(each, image1, image2, size)[0] for each, size in zip(flows, sizes, strict=True)]
+
+    def at(size: tuple[int, int]) -> tuple[Flow, Tensor]:
+        flow = _flow_at(model, size, image1, image2)
+        return flow, sized_sigma(flow, image1, image2, size)[0]
+
+    flows, sigmas = zip(*_side_by_side([partial(at, size) for size in sizes], image1.is_cuda), strict=True)
     chosen = torch.stack(sigmas).mean(dim=(2, 3, 4)).argmin(dim=0)
     return *flows, chosen, _share_beyond(flows[0] - flows[1]) > DIFFERENT
 
