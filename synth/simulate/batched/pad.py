@@ -81,7 +81,7 @@ class Pad:
 def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = None) -> Pad:
     """Prepare the pad of a scene, for all scenes of the same mesh, materials and element.
 
-    InputError for CUDA without cuBLAS or cuSOLVER.
+    `products` are the pad's, see `Pad`. InputError for CUDA without cuSOLVER.
     """
     check_mesh(mesh)
     material = pad_material(scene.sensor.gel, mesh)

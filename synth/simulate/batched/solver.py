@@ -54,6 +54,7 @@ class BatchedSolver:
     """See the module's docstring.
 
     A trajectory records at most `records` states; `grid` are the counts of the largest distance grid of the indenters.
+    InputError for CUDA without cuBLAS.
     """
 
     def __init__(self, pad: Pad, batch: int, records: int, grid: tuple[int, int, int]) -> None:
@@ -86,7 +87,7 @@ class BatchedSolver:
             wp.synchronize_device(device)
 
     def _load_own_kernels(self) -> None:
-        """On a new machine they are compiled, all at once."""
+        """Load the kernels made for this pad; on a new machine they are compiled, all at once."""
         flat = ((self._product, BLOCK), (self._contact_product, THREADS))
         tiled = ((kernel, self._block) for kernel in (self._arnoldi, self._solution))
         with ThreadPoolExecutor() as threads:
