@@ -99,15 +99,17 @@ def draw(
 def samples_of(template: Template, seed: int, trajectory: int, steps: int) -> list[SampleFrames]:
     """All samples of a trajectory with that many recorded states: a clip of all of them, or pairs.
 
-    The first pair shows the undeformed gel and the last state; the others are drawn from all other pairs i < j.
+    The first pair shows the undeformed gel and the last state. Each further state, drawn at random, makes a pair with
+    every one before it: few states are rendered for many pairs.
     """
     sensor, count = sensor_of(template, trajectory), template.sampling.samples_per_trajectory
     if template.sampling.kind == "clips":
         return [SampleFrames(trajectory, trajectory, sensor, tuple(range(steps + 1)))]
-    others = [(i, j) for i in range(steps) for j in range(i + 1, steps + 1) if (i, j) != (0, steps)]
     rng = stream(template, seed, "pairs", trajectory)
-    frames = [(0, steps), *(others[k] for k in rng.permutation(len(others)))]
-    return [SampleFrames(trajectory * count + k, trajectory, sensor, frames[k]) for k in range(count)]
+    shown = [0, steps, *(1 + rng.permutation(steps - 1)).tolist()]
+    frames = [(state, other) for k, state in enumerate(shown) for other in rng.permutation(shown[:k]).tolist()]
+    first = trajectory * count
+    return [SampleFrames(first + k, trajectory, sensor, (min(pair), max(pair))) for k, pair in enumerate(frames[:count])]
 
 
 def check_pairs(scene: Scene) -> None:

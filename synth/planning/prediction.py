@@ -6,6 +6,7 @@ seconds, so that `generate`, which needs none of this, does not ask for it.
 """
 
 import contextlib
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,8 +119,8 @@ def predict(plan: Plan) -> Prediction:
     sampling, corner = template.sampling, template.corners[0]
     samples = sampling.samples_per_trajectory
     steps = float(np.mean([one.motion.steps for one in template.corners]))
-    images, flows = (steps + 1, steps) if sampling.kind == "clips" else (2.0, 1.0)
-    rendered = (steps if sampling.kind == "clips" else 1 + 1 / samples) if outputs.images else 0.0
+    images, flows, pressed = (steps + 1, steps, steps) if sampling.kind == "clips" else (2.0, 1.0, _pressed(samples))
+    rendered = (pressed + 1 / sampling.trajectories_per_sensor) / samples if outputs.images else 0.0
     cameras = [view.camera for view in corner.sensor.views.values()]
     meshes = _tetwild_meshes if plan.mesh.kind == "tetwild" else _meshes
     presses, resolution, error_px, error_percent = meshes(plan)
@@ -149,6 +150,11 @@ def predict(plan: Plan) -> Prediction:
         bytes_per_pair=round(pixels * (flow_bytes + image_bytes)),
         memory_bytes=round(memory),
     )
+
+
+def _pressed(pairs: int) -> float:
+    """States that are rendered beside the undeformed one: k of them make k (k + 1) / 2 pairs."""
+    return math.ceil((math.sqrt(1 + 8 * pairs) - 1) / 2)
 
 
 def _lost_detail(plan: Plan) -> str:

@@ -49,7 +49,7 @@ class Sampling(Part):
     """pairs: two states of a trajectory; clips: all recorded states of one."""
     frames_per_second: Positive = 25.0
     """Of clips."""
-    pairs_per_trajectory: Annotated[int, Field(ge=1, le=1000)] = 2
+    pairs_per_trajectory: Annotated[int, Field(ge=1, le=1000)] = 3
     trajectories_per_sensor: Annotated[int, Field(ge=1, le=100000)] = 2
     common_draws: bool = False
     """Draw by seed and number alone: scenes that differ in fixed values get the same gels and presses."""

@@ -111,8 +111,12 @@ def test_a_sensor_that_cannot_be_used_is_drawn_again_and_at_last_says_why(tiny: 
     refused(r"sensor\.camera\.vignetting", draw, template, 0, 0)
 
 
-@pytest.mark.parametrize(("pairs", "steps"), [(1, 1), (2, 2), (4, 3), (6, 3)])
-def test_pairs_are_numbered_distinct_and_begin_with_the_whole_motion(tiny: Path, pairs: int, steps: int) -> None:
+@pytest.mark.parametrize(
+    ("pairs", "steps", "states"), [(1, 1, 2), (2, 2, 3), (3, 6, 3), (4, 6, 4), (6, 3, 4), (7, 6, 5), (21, 6, 7)]
+)
+def test_pairs_are_distinct_begin_with_the_whole_motion_and_share_states(
+    tiny: Path, pairs: int, steps: int, states: int
+) -> None:
     template = load_scene(tiny, [f"sampling.pairs_per_trajectory={pairs}", "sampling.trajectories_per_sensor=2"])
     for trajectory in range(4):
         found = samples_of(template, 0, trajectory, steps)
@@ -120,6 +124,7 @@ def test_pairs_are_numbered_distinct_and_begin_with_the_whole_motion(tiny: Path,
         assert {(pair.trajectory, pair.sensor) for pair in found} == {(trajectory, trajectory // 2)}
         assert found[0].frames == (0, steps)
         assert len({pair.frames for pair in found}) == pairs
+        assert len({frame for pair in found for frame in pair.frames}) == states
         assert all(0 <= i < j <= steps for i, j in (pair.frames for pair in found))
         assert found == samples_of(template, 0, trajectory, steps)
 
