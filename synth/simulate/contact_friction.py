@@ -201,7 +201,7 @@ def contact_stiffness(
     faces: Faces,
     indenters: Indenters,
     state: ContactState,
-    max_turn: wp.float64,
+    max_turn: wp.array(dtype=wp.float64),
     touching: wp.array2d(dtype=wp.int32),
     symmetric: wp.array3d(dtype=wp.mat33d),
     remainder: wp.array3d(dtype=wp.mat33d),
@@ -209,7 +209,7 @@ def contact_stiffness(
     """One thread per (sample, face): -∂t/∂x at its points, as a symmetric matrix and what is left over.
 
     touching: (B, f) 0: nothing touches, the matrices are not written; 1: nothing is left over; 2: something is.
-    max_turn: most (rad) that H turns a mesh's normal over what a point is deeper than its multiplier says.
+    max_turn: (B,) most (rad) that H turns a mesh's normal over what a point is deeper than its multiplier says.
     """
     s, f = wp.tid()
     if active[s] == 0:
@@ -237,7 +237,7 @@ def contact_stiffness(
             touching[s, f] = wp.max(touching[s, f], 1)
             if indenters.kind[s] == 5:
                 touching[s, f] = 2
-                whole = state.normal[s, f, q] + max_turn * stiffness / wp.max(wp.sqrt(wp.ddot(H, H)), TINY)
+                whole = state.normal[s, f, q] + max_turn[s] * stiffness / wp.max(wp.sqrt(wp.ddot(H, H)), TINY)
                 H = wp.min(whole / pressure, wp.float64(1.0)) * H
             block = (stiffness * steep) * wp.outer(n, n) - pressure * H
             remainder[s, f, q] = half * (block - wp.transpose(block))

@@ -21,9 +21,6 @@ MAX_ROUGH_ITERATIONS = 5
 """Iterations after which directions are exact: far from the solution rough ones may not get there at all."""
 ROUGH_ABOVE = 1e-5
 """A tolerance above it is reached with rough directions and earlier factors."""
-MAX_TURN = 0.1
-"""`max_turn` of `contact_stiffness` until NEAR: iterates are far deeper in edges than equilibria, and the gap's
-second derivative misleads there."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +105,7 @@ class DirectSolver:
         """The Newton direction: a rough one, by an earlier tangent's factor, where it needs not be exact."""
         newton, far = wanted.viscosity is None, wanted.relative > NEAR
         rough = newton and wanted.iteration < MAX_ROUGH_ITERATIONS and (wanted.tolerance > ROUGH_ABOVE or far)
-        state, turn = self.iterate.state, MAX_TURN if newton and far else np.inf
-        tangent = self.system.tangent(state, self.indenter, wanted.viscosity or 0.0, turn)
+        tangent = self.system.tangent(self.iterate.state, self.indenter, wanted.viscosity or 0.0, wanted.max_turn)
         reuse = rough or wanted.tolerance > ROUGH_ABOVE
         self._direction = self.system.newton_step(tangent, self.iterate.residual.free, rough, reuse)
         return bool(np.isfinite(self._direction.u).all())

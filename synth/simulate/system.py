@@ -163,9 +163,9 @@ class System:
         if self.mixed:
             slots = [pattern.coupling_slot, pattern.pressure_slot]
             _launch(pressure_tangent, elements, self._bulk, held, pushed, *slots, values)
-        contact = [u, self._active, self._faces, indenter, self.contact]
+        contact = [u, self._active, self._faces, indenter, self.contact, _array(np.array([turn]), wp.float64)]
         faces, touching, remainder = self._points[:2], self._touching, self._remainder
-        _launch(contact_stiffness, faces, *contact, turn, touching, self._stiffness, remainder)
+        _launch(contact_stiffness, faces, *contact, touching, self._stiffness, remainder)
         blocks = [self._faces, self._face_pairs, touching, self._stiffness, pattern.face_slot]
         _launch(contact_tangent, (faces[1], len(pattern.face_pairs)), *blocks, values)
         return Tangent(values.numpy()[:-1], self._unsymmetric(touching.numpy()[0], remainder.numpy()[0]))

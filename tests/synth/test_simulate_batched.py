@@ -177,6 +177,20 @@ def test_indenters_that_find_no_point_are_told_apart_and_grids_may_be_unequal(tm
     assert same(found[0], found[2])
 
 
+def test_curvature_of_edges_is_limited_as_for_one_press(tmp_path: Path) -> None:
+    """A cube's corner; with all of the curvature another equilibrium was found."""
+    import pyvista as pv  # which need not be there for what runs on a GPU
+
+    pv.Cube(x_length=2.0, y_length=1.5, z_length=1.0).triangulate().save(tmp_path / "cube.stl")
+    cube = {"shape": "mesh", "file": "cube.stl", "cell_mm": 0.25, "rotation_deg": [30.0, 20.0, 0.0]}
+    motion = {"depth_mm": 0.5, "shear_mm": [0.1, 0.1], "steps": 2}
+    posed = scene(indenter=cube, friction=0.4, motion=motion, numerics={"tolerance": TOLERANCE})
+    one, other = alone(posed, MESH, tmp_path), simulate_scenes([posed], MESH, tmp_path)[0]
+    assert apart(one, other) < AGREEMENT
+    for s, t in zip(one.states, other.states, strict=True):
+        assert t.newton_iterations == pytest.approx(s.newton_iterations, abs=2)
+
+
 @pytest.mark.parametrize(
     ("element", "poisson_ratio", "stiffening"),
     [("p2p1", 0.4999, (0.0, 0.0)), ("p2p1", 0.4999, (0.3, 0.1)), ("p1p1", 0.45, (0.2, 0.0)), ("p2p1", 0.2, (0.0, 0.0))],
@@ -219,7 +233,7 @@ def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, sti
     touching = zeros(points[:2], wp.int32)
     symmetric, remainder = (zeros(points, wp.mat33d) for _ in range(2))
     contact = zeros(points, wp.mat33f)
-    inputs = [displacement, mask, faces, bodies, body.contact, np.inf]
+    inputs = [displacement, mask, faces, bodies, body.contact, given(np.array([np.inf]), wp.float64)]
     launch(contact_stiffness, points[:2], inputs, [touching, symmetric, remainder])
     assert (touching.numpy() == 2).any()
     launch(store_contact, points[:2], [mask, touching, faces.weight, symmetric, remainder], [contact])

@@ -39,7 +39,8 @@ class BatchArrays:
         self.orders, self.numbers = zeros(batch, wp.int32), zeros((batch, len(Number)), wp.float64)
         self.seen = zeros((batch, Seen.FORCE + SCALARS), wp.float64)
         self.sums = self.seen[:, Seen.FORCE :]
-        self.viscosity, self.stiffness = (self.numbers[:, n] for n in (Number.VISCOSITY, Number.STIFFNESS))
+        columns = Number.VISCOSITY, Number.TURN, Number.STIFFNESS
+        self.viscosity, self.turn, self.stiffness = (self.numbers[:, n] for n in columns)
         self.asked_share, self.share = self.numbers[:, Number.SHARE], zeros(batch, wp.float64)
         self.fields: Fields = zeros_of(Fields, lambda _: values, device)
         self.residual, self.viscous = zeros(values, wp.float64), zeros(values, wp.float64)

@@ -85,7 +85,8 @@ class Lane:
                 if is_stale:
                     iterate = _evaluation((yield order | Order.EVALUATE))
                     order, is_stale = 0, False
-                numbers[Number.NORM], numbers[Number.VISCOSITY] = iterate.free, request.viscosity or 0.0
+                numbers[Number.NORM], numbers[Number.TURN] = iterate.free, request.max_turn
+                numbers[Number.VISCOSITY] = request.viscosity or 0.0
                 numbers[Number.GOAL] = self._goal(request, iterate.free / size)
                 size = iterate.free
                 seen = yield order | Order.SOLVE
@@ -99,7 +100,8 @@ class Lane:
                 if request.rigid:
                     numbers[Number.AT] = at + ask.PATH_DERIVATIVE_STEP * (target - at)
                     seen = yield order | Order.BEGIN | Order.STICKING | Order.EVALUATE
-                    numbers[Number.AT], numbers[Number.VISCOSITY], numbers[Number.NORM] = at, 0.0, seen[Seen.FREE]
+                    numbers[Number.AT], numbers[Number.NORM] = at, seen[Seen.FREE]
+                    numbers[Number.VISCOSITY], numbers[Number.TURN] = 0.0, np.inf
                     numbers[Number.GOAL] = min(GMRES_TOLERANCE, self._forcing)
                     seen = yield Order.SOLVE | Order.STICKING
                     while not seen[Seen.DONE]:

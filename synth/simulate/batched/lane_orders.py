@@ -41,7 +41,7 @@ class Order:
 class Number(IntEnum):
     """Columns of the numbers that go with orders."""
 
-    AT, RATIO, SHARE, VISCOSITY, STIFFNESS, NORM, GOAL, RECORD = range(8)
+    AT, RATIO, SHARE, VISCOSITY, TURN, STIFFNESS, NORM, GOAL, RECORD = range(9)
 
 
 class Seen(IntEnum):

@@ -229,7 +229,7 @@ class BatchedSolver:
         if self._barrier is not None:
             self._launch(find_inverting, elements, mask, u, self._barrier, a.inverting)
         law, matrices = (self._faces, a.indenters, a.contact), (a.symmetric, a.remainder)
-        self._launch(contact_stiffness, self._face_dim, u, mask, *law, np.inf, a.touching, *matrices)
+        self._launch(contact_stiffness, self._face_dim, u, mask, *law, a.turn, a.touching, *matrices)
         stored = (a.touching, self._faces.weight, *matrices, a.stored_contact)
         self._launch(store_contact, self._face_dim, mask, *stored)
         right = (self._single.unknown, a.residual, a.krylov)

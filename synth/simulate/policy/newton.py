@@ -24,6 +24,9 @@ MAX_ITERATIONS = 20
 NEAR = 1e-2
 """Relative residual below which the equilibrium is near: a solve may take up to twice its iterations, so that rounding
 does not decide whether the last met the tolerance."""
+MAX_TURN = 0.1
+"""`max_turn` of `contact_stiffness` until NEAR: iterates are far deeper in edges than equilibria, and the gap's
+second derivative misleads there."""
 SHORTEST = 1 / 1024
 """Shortest step of the line search."""
 INDIFFERENT = 0.3
@@ -60,7 +63,8 @@ def solve(at: Evaluation, tolerance: float, limit: int = MAX_ITERATIONS, reach_m
         stalled = not isfinite(at.relative) or (iterations >= STALL_ITERATIONS and at.relative >= STALLED_RESIDUAL)
         if stalled or iterations == 2 * limit or (iterations >= limit and at.relative > NEAR):
             break
-        finite: bool = yield Solve(at.relative, tolerance, iterations)
+        turn = MAX_TURN if at.relative > NEAR else inf
+        finite: bool = yield Solve(at.relative, tolerance, iterations, max_turn=turn)
         after = (yield from _line_search(at)) if finite else None
         if after is None:
             break

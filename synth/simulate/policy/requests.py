@@ -7,6 +7,7 @@ direction, what contact remembers, and snapshots of all that.
 from collections.abc import Generator
 from dataclasses import dataclass
 from enum import Enum
+from math import inf
 from typing import Any, TypeVar
 
 FORCE_FLOOR = 1e-6
@@ -76,13 +77,14 @@ class Solve:
     """Find the Newton direction at the iterate; answered by whether it is finite.
 
     The iterate's relative residual, the one that is wanted, and the iterations so far tell how exact it must be.
-    `viscosity` is relaxation's θ, None for Newton's method.
+    `viscosity` is relaxation's θ, None for Newton's method; `max_turn` is `contact_stiffness`'s.
     """
 
     relative: float
     tolerance: float
     iteration: int
     viscosity: float | None = None
+    max_turn: float = inf
 
 
 @dataclass(frozen=True)
