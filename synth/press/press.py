@@ -24,7 +24,7 @@ from synth.press.scene_path import path_of
 from synth.scene import MeshIndenter, RoundGel, Scene
 from synth.scene.numerics import MAX_PENALTY
 
-BLUNTER = ((1.5, 1.0), (1.5, 2.0), (2.25, 4.0), (1.8, 3.0), (1.0, 2.0))
+BLUNTER = ((1.5, 4.0), (2.25, 4.0), (1.8, 3.0), (1.0, 2.0))
 """Factors on the radius of an object's edges and on the contact stiffness, in turn, where its press is incomplete.
 Depth then counts from the rounded edge, as for any stated `fillet_mm`."""
 SEEN_PX = 1.0
