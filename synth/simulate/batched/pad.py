@@ -33,6 +33,7 @@ ON_HOST = ("contact_friction", "inversion_barrier", "stiffness")
 
 def load_kernels() -> None:
     """Load what simulation on a GPU needs of Warp; on a new machine modules are compiled, all at once."""
+    wp.init()  # which no two threads may do at once
     with ThreadPoolExecutor() as threads:
         beside = [threads.submit(wp.load_module, f"synth.simulate.{name}", "cpu") for name in ON_HOST]
         wp.load_module("synth.simulate", "cuda", recursive=True, max_workers=os.cpu_count() or 1)
