@@ -4,7 +4,7 @@ A run first makes one trajectory per worker, in which every process imports, com
 nothing else), then 2 n pairs. Instances of a scene come in a fixed order, so that the moment at which n of these are
 there is the time of a run of n: "growth" is time(2 n) / time(n), and "work_growth" the same of the work that the
 stages' own clocks counted, which differs from 2 as the random instances of the two halves do. Workers have one core
-each; without workers one process renders on all cores. "other_s" is sampling the scene, meshing and scheduling.
+each. "other_s" is sampling the scene, meshing and scheduling.
 """
 
 import json
@@ -45,9 +45,9 @@ def at_size(scene: str, assignments: Sequence[str], width: int, height: int) -> 
     return load_scene(scene, [*changes, *(f"sensor.camera.{name}={value:.6f}" for name, value in changed.items())])
 
 
-def run(template: Template, n: int, workers: int | None, device: Device, seed: int, folder: Path) -> Row:
+def run(template: Template, n: int, workers: int, device: Device, seed: int, folder: Path) -> Row:
     """Make 2 n pairs in an empty folder, and say how long they took."""
-    warm = (workers or 1) * template.corners[0].sampling.pairs_per_trajectory
+    warm = workers * template.corners[0].sampling.pairs_per_trajectory
     times: dict[int, float] = {}
     started = time.perf_counter()
 
@@ -100,25 +100,23 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         "--size", action="append", default=[], help="WIDTHxHEIGHT; default: the scene's own, and half of it"
     )
-    parser.add_argument(
-        "--workers", type=int, action="append", default=[], help="beside 0; default: 1, 2, 4 ... all cores"
-    )
+    parser.add_argument("--workers", type=int, action="append", default=[], help="default: 1, 2, 4 ... all cores")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument("--seed", type=int, default=0, help="of the pairs")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="changes of the scene")
     given = parser.parse_args(argv)
     camera = load_scene(given.scene, given.set).corners[0].sensor.camera
     sizes = [_size(text) for text in given.size] or [(camera.width // k, camera.height // k) for k in (2, 1)]
-    counts = [0, *(given.workers or [2**k for k in range(cores().bit_length())])]
-    if given.n < 1 or min(counts) < 0:
-        raise InputError("--n and --workers: give whole numbers from 1 on; a run without workers is made anyway")
+    counts = given.workers or [2**k for k in range(cores().bit_length())]
+    if given.n < 1 or min(counts) < 1:
+        raise InputError("--n and --workers: give whole numbers from 1 on")
     common = {"scene": given.scene, "changes": " ".join(given.set), "seed": given.seed, "n": given.n}
     cases = [{**common, "width": w, "height": h, "workers": count} for w, h in sizes for count in counts]
 
     def one(case: Row) -> Row:
         template = at_size(given.scene, given.set, case["width"], case["height"])
         with tempfile.TemporaryDirectory(prefix="scale-", dir=given.out) as folder:
-            return run(template, given.n, case["workers"] or None, given.device, given.seed, Path(folder) / "pairs")
+            return run(template, given.n, case["workers"], given.device, given.seed, Path(folder) / "pairs")
 
     given.out.mkdir(parents=True, exist_ok=True)
     rows = measure(given.out / "scale.csv", cases, one)
@@ -135,8 +133,8 @@ def main(argv: list[str]) -> int:
         }
         for pairs in JOBS
     ]
-    workers = f"{best['workers'] or 'no'} workers"
-    show(larger, list(larger[0]), f"Extrapolated from {best['width']} x {best['height']} px with {workers}")
+    size = f"{best['width']} x {best['height']} px"
+    show(larger, list(larger[0]), f"Extrapolated from {size} with {best['workers']} workers")
     plot(given.out / "scale.png", rows, x="workers", y="pairs_per_second", group="width")
     return 0
 

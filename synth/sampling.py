@@ -108,8 +108,10 @@ def samples_of(template: Template, seed: int, trajectory: int, steps: int) -> li
     rng = stream(template, seed, "pairs", trajectory)
     shown = [0, steps, *(1 + rng.permutation(steps - 1)).tolist()]
     frames = [(state, other) for k, state in enumerate(shown) for other in rng.permutation(shown[:k]).tolist()]
-    first = trajectory * count
-    return [SampleFrames(first + k, trajectory, sensor, (min(pair), max(pair))) for k, pair in enumerate(frames[:count])]
+    return [
+        SampleFrames(trajectory * count + k, trajectory, sensor, (min(pair), max(pair)))
+        for k, pair in enumerate(frames[:count])
+    ]
 
 
 def check_pairs(scene: Scene) -> None:
