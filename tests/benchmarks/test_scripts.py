@@ -142,14 +142,12 @@ def test_throughput_keeps_earlier_runs(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["scale", "--scene", str(write_tiny(tmp_path)), "--n", "4", "--size", "32x24", "--workers", "1"]
-    ((alone, row),) = again([*command, "--set", "motion.depth_mm=-1.0"], tmp_path / "out", "scale.csv")
-    assert (alone["workers"], alone["pairs"], row["workers"], row["pairs"]) == (0, 8, 1, 8)
+    ((row,),) = again([*command, "--set", "motion.depth_mm=-1.0"], tmp_path / "out", "scale.csv")
+    assert (row["workers"], row["pairs"]) == (1, 8)
     assert row["pairs_per_second"] == row["pairs"] / row["seconds"]
-    for one in (alone, row):  # one process: stages are parts of the whole
-        work = sum(one[f"{stage}_s"] for stage in ("simulate", "render", "flow", "write"))
-        assert 0 < work <= one["seconds"] / one["pairs"]
-    # Of the same pairs, less digits of seconds.
-    assert row["bytes_per_pair"] == pytest.approx(alone["bytes_per_pair"], rel=0.01)
+    work = sum(row[f"{stage}_s"] for stage in ("simulate", "render", "flow", "write"))
+    assert 0 < work <= row["seconds"] / row["pairs"]  # one process: stages are parts of the whole
+    assert row["bytes_per_pair"] > 1000
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["scale.csv", "scale.png"]
     assert "Extrapolated from 32 x 24 px" in capsys.readouterr().out
 
