@@ -152,7 +152,7 @@ def predict(plan: Plan) -> Prediction:
     )
 
 
-def _pressed(pairs: int) -> float:
+def _pressed(pairs: int) -> int:
     """States that are rendered beside the undeformed one: k of them make k (k + 1) / 2 pairs."""
     return math.ceil((math.sqrt(1 + 8 * pairs) - 1) / 2)
 
